@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.archive import MAGIC, read_archive, write_archive
+from formats.archive import MAGIC, read_archive, sha256_of_bytes, write_archive
 from formats.atomic import atomic_writer, check_writable
 from formats.blocks import Instance, Unfolded, unfolded
 from formats.camera_set import read_camera_set
@@ -31,7 +31,6 @@ from formats.records import (
     decode_header,
     encode_field,
     member_name,
-    sha256_of_bytes,
 )
 from formats.safe_input import open_input
 from formats.scene import FORMAT, MEMBER, SceneGraph, dump_scene, parse_scene, read_scene
@@ -140,7 +139,8 @@ class BundleWriter:
         """
         if SHARED in record.metadata:
             record = self._with_parts_apart(record, precision)
-        name, data = field_member(record, precision)
+        data = encode_field(record, precision)
+        name = member_name(data)
         self.members[name] = data
         return name
 
@@ -184,12 +184,6 @@ class BundleWriter:
             write_archive(file, members)
 
 
-def field_member(record: FieldRecord, precision: str = "float16") -> tuple[str, bytes]:
-    """The member name and bytes of one field."""
-    data = encode_field(record, precision)
-    return member_name(data), data
-
-
 def read_bundle(path: Path | str, *, verify: bool = True) -> Bundle:
     """The bundle at `path`, every byte of it checked; without `verify` the checksums are not.
 
@@ -226,24 +220,27 @@ def read_summary(path: Path | str) -> dict:
     Boxes are (6,) lists: `aabb` in the object's frame, `world_aabb` the box around its eight placed corners.
     `objects` are what a fused field was made of (formats/object_summary.py); a plain scene has nodes alone.
     """
-    if _is_json(path):
+    with open_input(path) as file:
+        is_json = file.read(64).lstrip()[:1] == b"{"
+    if is_json:
         return summary_of(read_scene(path), str(path), Path(path).stat().st_size)
     views = read_archive(path)
     read = _unfolded(views, str(path), verify=False)
-    fields = [_field_summary(name, header) for name, header in sorted(read.headers.items())]
+    # The size of the file that was mapped: the path may name another file by now.
+    return summary_of(read.scene, str(path), len(views[SCENE].obj), read.headers)
+
+
+def summary_of(
+    scene: SceneGraph, path: str, size: int, headers: dict[str, FieldHeader] | None = None
+) -> dict:
+    """`read_summary` of a scene that was read from `path`, in so many bytes; headers: those of a bundle."""
     return {
-        "path": str(path),
-        "format": FORMAT,
-        # The size of the file that was mapped: the path may name another file by now.
-        "bytes": len(views[SCENE].obj),
-        **_scene_summary(read.scene, read.headers),
-        "fields": fields,
+        "path": path,
+        "format": "scene" if headers is None else FORMAT,
+        "bytes": size,
+        **_scene_summary(scene, headers or {}),
+        "fields": [_field_summary(name, header) for name, header in sorted((headers or {}).items())],
     }
-
-
-def summary_of(scene: SceneGraph, path: str, size: int) -> dict:
-    """`read_summary` of a scene that was read from `path`, in so many bytes."""
-    return {"path": path, "format": "scene", "bytes": size, **_scene_summary(scene, {}), "fields": []}
 
 
 def is_bundle(path: Path | str) -> bool:
@@ -309,11 +306,6 @@ def _checked_members(views: dict[str, memoryview], where: str, verify: bool) -> 
     if names != sorted(names):
         raise BadHeader(f"{where}: its members are not sorted by name; write it with fusedrf")
     return {name: views[name] for name in names}
-
-
-def _is_json(path: Path | str) -> bool:
-    with open_input(path) as file:
-        return file.read(64).lstrip()[:1] == b"{"
 
 
 def _scene_summary(scene: SceneGraph, headers: dict[str, FieldHeader]) -> dict:

@@ -10,6 +10,7 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -164,14 +165,10 @@ def read_model(folder: Path, most_points: int = MAX_POINTS) -> Model:
             view = replace(view, near=near, far=far, seen=points.sure(indices))
         return Image(name, where, view)
 
-    listed, repeated = once(folder, listed, _listed_name, lambda item: (*item[2], *item[3]))
-    images, broken = read_sound(folder, listed, read, _listed_name)
+    listed, repeated = once(folder, listed, itemgetter(1), lambda item: (*item[2], *item[3]))
+    images, broken = read_sound(folder, listed, read, itemgetter(1))
     notes = (*repeated, *broken, *notes, *points_notes(folder, points and points.points))
     return Model(folder, tuple(images), points and points.points, notes)
-
-
-def _listed_name(listing: tuple) -> str:
-    return listing[1]
 
 
 def _images(folder: Path) -> list[tuple]:

@@ -213,7 +213,9 @@ def parse_scene(data: bytes, where: str) -> SceneGraph:
     try:
         spec = msgspec.convert(known, SceneSchema)
         roots = tuple(_build_node(node) for node in nodes)
-        shown = _framing(content), _cameras(content)
+        if "cameras" in content:
+            read_camera_set(content["cameras"])
+        shown = _framing(content), content.get("cameras")
         history = tuple(spec.history)
         return SceneGraph(roots, spec.composition, history, spec.generator, spec.version, extras, *shown)
     except msgspec.ValidationError as error:
@@ -314,13 +316,6 @@ def _framing(content: dict) -> tuple[float, ...] | None:
     ):
         raise BadSchema(f"framing {box} is no box, expected each minimum below its maximum")
     return tuple(float(number) for number in box)
-
-
-def _cameras(content: dict) -> dict | None:
-    """The cameras as they stand in the file, once they are known to be readable."""
-    if "cameras" in content:
-        read_camera_set(content["cameras"])
-    return content.get("cameras")
 
 
 def _check_extent(nodes: object, where: str) -> None:

@@ -253,7 +253,14 @@ def _placed(
     if points is None or not len(points.positions) or not views:
         return None
     candidates = [points, *(points.moved(matrix) for matrix in _applied(path, document))]
-    return max(candidates, key=lambda moved: _seen_share(moved, views))
+    some = views[:: max(1, len(views) // 20)]
+
+    def share(moved: SparsePoints) -> float:
+        """How many of the points some views show."""
+        few = _sample(moved)[::10]
+        return float(np.mean([view.shown(few)[3].mean() for view in some]))
+
+    return max(candidates, key=share)
 
 
 def _agrees(points: SparsePoints, seen: Mapping[str, np.ndarray], views: tuple[View, ...]) -> bool:
@@ -282,8 +289,3 @@ def _applied(path: Path, document: dict) -> list[np.ndarray]:
 
 def _sample(points: SparsePoints) -> np.ndarray:
     return points.positions[:: max(1, len(points.positions) // MAX_PROJECTED)]
-
-
-def _seen_share(points: SparsePoints, views: tuple[View, ...]) -> float:
-    few = _sample(points)[::10]
-    return float(np.mean([view.shown(few)[3].mean() for view in views[:: max(1, len(views) // 20)]]))

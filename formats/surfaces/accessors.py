@@ -69,9 +69,8 @@ class Buffers:
     def view(self, index: int) -> memoryview:
         entry = self.item("buffer_views", index)
         for name in MESHOPT:
-            if name in entry.extensions:
+            if (packed := entry.extension(name, schema.Meshopt, self.path)) is not None:
                 if index not in self.unpacked:
-                    packed = schema.typed(entry.extensions[name], schema.Meshopt, f"{self.path}: {name}")
                     self.unpacked[index] = self._unpack(packed, name)
                 return self.unpacked[index][: entry.byte_length]
         return self._cut(entry.buffer, entry.byte_offset, entry.byte_length, f"buffer view {index}")

@@ -199,11 +199,10 @@ class _Reader:
             if index not in within:
                 continue
             node = document.nodes[index]
-            if VISIBILITY in node.extensions:
-                raw = node.extensions[VISIBILITY]
-                if not schema.typed(raw, schema.Visibility, f"{self.path}: {VISIBILITY}").visible:
-                    self.hidden += 1
-                    continue
+            visibility = node.extension(VISIBILITY, schema.Visibility, self.path)
+            if visibility is not None and not visibility.visible:
+                self.hidden += 1
+                continue
             within.update(node.children)
             shown.append(index)
         if self.hidden:
@@ -230,13 +229,13 @@ class _Reader:
         return surfaces
 
     def _instances(self, node: schema.Node, world: np.ndarray) -> list[np.ndarray]:
-        if INSTANCING not in node.extensions:
+        instancing = node.extension(INSTANCING, schema.Instancing, self.path)
+        if instancing is None:
             return [world]
-        typed = schema.typed(node.extensions[INSTANCING], schema.Instancing, f"{self.path}: {INSTANCING}")
         given = {
-            name: self.buffers.numbers(typed.attributes[name], (width,)).astype(np.float64)
+            name: self.buffers.numbers(instancing.attributes[name], (width,)).astype(np.float64)
             for name, width in (("TRANSLATION", 3), ("ROTATION", 4), ("SCALE", 3))
-            if name in typed.attributes
+            if name in instancing.attributes
         }
         counts = {len(rows) for rows in given.values()}
         if len(counts) != 1:
@@ -309,11 +308,11 @@ class _Shape:
     def _draco(self) -> dict[str, np.ndarray]:
         """Decoded attributes by name, and "indices"; nothing where the primitive is not compressed, or where
         it has its plain numbers too and the library is missing."""
-        if DRACO not in self.primitive.extensions:
+        draco = self.primitive.extension(DRACO, schema.Draco, self.where)
+        if draco is None:
             return {}
-        typed = schema.typed(self.primitive.extensions[DRACO], schema.Draco, f"{self.where}: {DRACO}")
         try:
-            return draco_arrays(bytes(self.buffers.view(typed.buffer_view)), typed.attributes, self.where)
+            return draco_arrays(bytes(self.buffers.view(draco.buffer_view)), draco.attributes, self.where)
         except MissingExtra:
             accessors = [self.buffers.item("accessors", i) for i in self.primitive.attributes.values()]
             if any(accessor.buffer_view is None for accessor in accessors):

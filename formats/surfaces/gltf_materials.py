@@ -72,8 +72,8 @@ class Materials:
         self._tell_unused(material, name)
         metallic = material.pbr_metallic_roughness
         factor, info = metallic.base_color_factor, metallic.base_color_texture
-        if GLOSSINESS in material.extensions:
-            glossy = self._extension(material, GLOSSINESS, schema.Glossiness)
+        glossy = material.extension(GLOSSINESS, schema.Glossiness, self.buffers.path)
+        if glossy is not None:
             required = GLOSSINESS in self.document.extensions_required
             if required or glossy.diffuse_factor or glossy.diffuse_texture:  # or it says nothing of colour
                 factor, info = glossy.diffuse_factor, glossy.diffuse_texture
@@ -85,9 +85,8 @@ class Materials:
         return Appearance(base, self._glow(material, name), cutoff, blend, not material.double_sided)
 
     def _glow(self, material: schema.Material, name: str) -> Slot | None:
-        strength = 1.0
-        if STRENGTH in material.extensions:
-            strength = self._extension(material, STRENGTH, schema.EmissiveStrength).emissive_strength
+        stated = material.extension(STRENGTH, schema.EmissiveStrength, self.buffers.path)
+        strength = 1.0 if stated is None else stated.emissive_strength
         factor = [max(strength, 0) * max(value, 0) for value in material.emissive_factor or (0, 0, 0)]
         if max(factor) == 0:
             return None
@@ -99,24 +98,18 @@ class Materials:
         if info is None:
             return Slot(colour, None, 0, None)
         tex_coord, transform = info.tex_coord, None
-        if TRANSFORM in info.extensions:
-            moved = self._extension(info, TRANSFORM, schema.TextureTransform)
+        moved = info.extension(TRANSFORM, schema.TextureTransform, self.buffers.path)
+        if moved is not None:
             transform = _transform(moved)
             tex_coord = tex_coord if moved.tex_coord is None else moved.tex_coord
         return Slot(colour, self._texture(info.index, name), tex_coord, transform)
-
-    def _extension(self, owner: schema.Part, name: str, kind):
-        return schema.typed(owner.extensions[name], kind, f"{self.buffers.path}: {name}")
 
     # --- textures -------------------------------------------------------------------------------------------
 
     def _texture(self, index: int, name: str) -> Texture | None:
         texture = self.buffers.item("textures", index)
-        sources = [
-            self._extension(texture, extension, schema.Sourced).source
-            for extension in PICTURE_EXTENSIONS
-            if extension in texture.extensions
-        ]
+        others = [texture.extension(n, schema.Sourced, self.buffers.path) for n in PICTURE_EXTENSIONS]
+        sources = [other.source for other in others if other is not None]
         for source in (*sources, texture.source):
             pixels = None if source is None else self._picture(source, name)
             if pixels is not None:
@@ -161,9 +154,8 @@ class Materials:
         unused = [slot for slot, info in slots.items() if info is not None]
         known = (GLOSSINESS, STRENGTH, UNLIT)
         unused += [extension for extension in material.extensions if extension not in known]
-        if GLOSSINESS in material.extensions:
-            glossy = self._extension(material, GLOSSINESS, schema.Glossiness)
-            unused += ["specularGlossinessTexture"] if glossy.specular_glossiness_texture else []
+        glossy = material.extension(GLOSSINESS, schema.Glossiness, self.buffers.path)
+        unused += ["specularGlossinessTexture"] if glossy and glossy.specular_glossiness_texture else []
         if unused:
             self.notes.add(f"shown unlit, by colour alone; not used: {listed(unused)}", name)
 

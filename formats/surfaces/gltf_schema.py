@@ -28,6 +28,10 @@ class Part(msgspec.Struct, rename="camel", gc=False):
 
     extensions: Extensions = {}
 
+    def extension(self, name: str, kind: type[Kind], where: object) -> Kind | None:
+        """One of its extensions, None without it. Raises BadJson, BadMesh."""
+        return typed(self.extensions[name], kind, f"{where}: {name}") if name in self.extensions else None
+
 
 class Named(Part):
     name: str = ""

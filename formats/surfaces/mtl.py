@@ -220,10 +220,8 @@ class Appearances:
         return np.ones(3) if texture is not None else np.clip(kd, 0, 1)
 
     def _glow(self, material: Material, called: str) -> Paint | None:
-        ke, texture = (
-            material.colours.get("ke", (0, 0, 0)),
-            self._texture(material.maps.get("map_ke"), called),
-        )
+        ke = material.colours.get("ke", (0, 0, 0))
+        texture = self._texture(material.maps.get("map_ke"), called)
         if max(ke) <= 0:
             return None
         self.notes.add("glows, which is added to its colour", called)
