@@ -17,7 +17,7 @@ import numpy as np
 
 from formats import colmap, llff, opensfm, polycam
 from formats.atomic import atomic_writer
-from formats.cameras import BENDS, FISHEYE_BENDS, read_cameras, read_document
+from formats.cameras import BENDS, FISHEYE_BENDS, read_document
 from formats.capture_of import capture_of
 from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NotACapture, NoViews, printable
 from formats.frame_list import SplitPart, read_listed, read_sound, repair_notes
@@ -34,9 +34,6 @@ from formats.photos import (
     is_file,
     is_hidden,
     is_picture,
-    load_ignored,
-    load_images,
-    load_photos,
     natural,
     on_photo,
     pictures,
@@ -49,28 +46,13 @@ from formats.transforms import (
     sparse_points,
     stated_aabb,
 )
-from formats.views import Capture, View, hold_out
+from formats.views import Capture, View
 
 LEVELS, MAX_FOLDERS = 3, 500
 """How deep captures are looked for below a folder without poses, and in how many folders of one depth."""
 
 CAMERAS = "cams"
 """A folder of cameras that are not read, as MVSNet has one."""
-
-__all__ = [
-    "Capture",
-    "View",
-    "hold_out",
-    "is_capture",
-    "is_mesh",
-    "load_ignored",
-    "load_images",
-    "load_photos",
-    "read_cameras",
-    "read_capture",
-    "write_cameras",
-    "write_capture",
-]
 
 
 def is_capture(path: Path | str) -> bool:

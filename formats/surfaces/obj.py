@@ -15,8 +15,6 @@ from formats.surfaces.surface import (
     Notes,
     Paint,
     Surface,
-    check_budget,
-    check_indices,
     laid,
     sound_colours,
 )
@@ -164,7 +162,6 @@ def _surfaces(text: _Text, path: Path | str, n_bytes: int, painted: bytes, notes
     if not text.counts:
         return []
     counts, used = np.array(text.counts), np.array(text.used)
-    check_budget(path, int((counts - 2).sum()), n_bytes)
     try:
         positions, colours = _points(text.points)
         uvs = _uvs(text.uvs)
@@ -173,8 +170,7 @@ def _surfaces(text: _Text, path: Path | str, n_bytes: int, painted: bytes, notes
     if painted and colours is None:
         colours = _polypaint(painted, len(positions), notes)
     corners = np.concatenate(text.corners)
-    check_indices(path, corners[:, 0], len(positions))
-    corner_indices, polygon = triangulated(counts, corners[:, 0], positions)
+    corner_indices, polygon = triangulated(path, counts, corners[:, 0], positions, n_bytes)
     beside = Beside(path)
     materials = _materials(text, beside, path, notes)
     names = _chosen(text, materials, notes)

@@ -9,7 +9,7 @@ from formats.errors import BadMesh
 from formats.safe_input import read_input
 from formats.surfaces.lines import table, within
 from formats.surfaces.polygons import triangulated
-from formats.surfaces.surface import Notes, Surface, check_budget, check_indices, sound_colours
+from formats.surfaces.surface import Notes, Surface, sound_colours
 
 KEYWORD = re.compile(r"(ST)?(C)?(N)?OFF$")
 OTHER = re.compile(r"(ST)?C?N?(4|4?n)OFF$")
@@ -47,9 +47,7 @@ def read_off(path: Path | str, notes: Notes) -> list[Surface]:
     if (widths - counts == 2).any():
         notes.add("colours that are numbers of a palette are not shown")
     corners = numbers[np.repeat(starts + 1, counts) + within(counts)].astype(np.int64)
-    check_budget(path, int(np.maximum(counts - 2, 0).sum()), len(data))
-    check_indices(path, corners, len(positions))
-    corner_indices, polygon = triangulated(counts, corners, positions)
+    corner_indices, polygon = triangulated(path, counts, corners, positions, len(data))
     faces = corners[corner_indices].astype(np.int32).reshape(-1, 3)
     face_colours = None if face_colours is None else face_colours[polygon]
     return [Surface(positions, faces, colours=colours, face_colours=face_colours)]

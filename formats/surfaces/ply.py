@@ -98,9 +98,7 @@ def _tell_unused(read: dict[str, dict], notes: Notes) -> None:
 
 def _polygons(path, lists: Lists, positions, n_bytes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(F, 3) vertices of triangles, which polygon each is of, and places of its corners in the lists."""
-    check_budget(path, int(np.maximum(lists.counts - 2, 0).sum()), n_bytes)
-    check_indices(path, lists.values, len(positions))
-    corner_indices, polygon = triangulated(lists.counts, lists.values, positions)
+    corner_indices, polygon = triangulated(path, lists.counts, lists.values, positions, n_bytes)
     return lists.values[corner_indices], polygon, corner_indices
 
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from formats.captures import load_photos, read_capture
+from formats.captures import read_capture
 from formats.errors import BadSchema, NoViews
 from formats.matching import match_photos
+from formats.photos import load_photos
 from formats.posing import photos_to_pose
 from tests.formats.test_readers import BIG, binary_model, llff_rows, ring
 

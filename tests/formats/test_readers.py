@@ -12,7 +12,7 @@ from PIL import Image as Pillow
 from PIL import ImageOps
 
 from formats import colmap
-from formats.captures import is_capture, load_ignored, load_images, load_photos, read_capture
+from formats.captures import is_capture, read_capture
 from formats.errors import (
     BadIntrinsics,
     BadMask,
@@ -26,6 +26,7 @@ from formats.errors import (
     NoViews,
     UnsupportedCamera,
 )
+from formats.photos import load_ignored, load_images, load_photos
 from formats.points import read_ply_points
 from formats.views import check_parallax
 from tests.formats.test_captures import PIXEL, POINT, POSE, SIZE, frame, photo, posed, project, real, write
