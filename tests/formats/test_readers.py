@@ -557,6 +557,19 @@ def test_points_of_a_ply(tmp_path, coding, colour):
     assert points.colours.tolist() == [[127, 255, 0]] * 3
 
 
+def test_points_beside_other_elements(tmp_path):
+    """Faces may come first, vertices may hold lists, and colours may have 16 bits."""
+    header = "ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int vertex_indices\n"
+    header += "element vertex 2\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "property list uchar float weights\n"
+    header += "".join(f"property ushort {hue}\n" for hue in ("red", "green", "blue"))
+    rows = "3 0 1 0\n1 2 3 2 0.5 0.5 65535 0 257\n4 5 6 0 0 65535 0\n"
+    (tmp_path / "p.ply").write_text(header + "end_header\n" + rows)
+    points = read_ply_points(tmp_path / "p.ply")
+    assert points.positions.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert points.colours.tolist() == [[255, 0, 1], [0, 255, 0]]
+
+
 BAD_CLOUDS = {
     "no ply": (b"solid", BadModel),
     "no end": (b"ply\nformat ascii 1.0\n", BadModel),
