@@ -24,7 +24,8 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from benchmarks.commit import commit_column, commit_line
 from benchmarks.paper.table import markdown
 from benchmarks.paper.work import Kept, fusedrf, tell
-from formats.captures import read_cameras, read_capture
+from formats.cameras import read_cameras
+from formats.captures import read_capture
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.scene import load_scene

@@ -22,9 +22,9 @@ from benchmarks.commit import commit_column, commit_line
 from benchmarks.paper.figures import over_time
 from benchmarks.paper.table import markdown
 from benchmarks.paper.work import fusedrf, stored_rows, tell, write_csv
-from formats.captures import hold_out, is_capture, read_capture
+from formats.captures import is_capture, read_capture
 from formats.errors import FormatError
-from formats.views import Capture, View
+from formats.views import Capture, View, hold_out
 from fusedrf_cli import plots
 from fusedrf_cli.bridge.pictures import camera_of, truth_of
 from fusedrf_cli.bridge.rendering import renderable

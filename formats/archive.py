@@ -6,6 +6,7 @@ still list and extract them.
 """
 
 import contextlib
+import hashlib
 import mmap
 import os
 import re
@@ -115,6 +116,14 @@ def pieces(data: bytes | memoryview) -> Iterator[bytes | memoryview]:
     for start in range(0, len(data), PIECE):
         yield data[start : start + PIECE]
         give_back(data)
+
+
+def sha256_of_bytes(data: bytes | memoryview) -> str:
+    """Hex SHA-256, a piece after the other."""
+    digest = hashlib.sha256()
+    for piece in pieces(data):
+        digest.update(piece)
+    return digest.hexdigest()
 
 
 def give_back(data: bytes | memoryview) -> None:

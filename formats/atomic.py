@@ -41,10 +41,7 @@ def atomic_writer(path: Path | str, *, mode: str = "wb", reserve: int = 0) -> It
     exception, KeyboardInterrupt too, leaves the old file and no temporary. Raises ResourceError: disk full,
     read-only, no permission.
     """
-    target = Path(os.path.realpath(path))
-    temporary = temporary_sibling(target)
-    unfinished.add(temporary)
-    try:
+    with _temporary(path) as (target, temporary):
         with open(temporary, mode.replace("w", "x"), encoding=None if "b" in mode else "utf-8") as file:
             if reserve:
                 _reserve(file.fileno(), reserve)
@@ -53,14 +50,6 @@ def atomic_writer(path: Path | str, *, mode: str = "wb", reserve: int = 0) -> It
             os.fsync(file.fileno())
         _keep_mode(target, temporary)
         os.replace(temporary, target)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        _explain(error, path, temporary, target)
-        raise
-    finally:
-        unfinished.discard(temporary)
-    sync_folder(target.parent)
 
 
 @contextlib.contextmanager
@@ -71,17 +60,26 @@ def atomic_folder(path: Path | str, *, overwrite: bool = False) -> Iterator[Path
     Flushed and with its mode kept as by `atomic_writer`. Raises ResourceError.
     """
     check_writable(path, overwrite, folders=True)
-    target = Path(os.path.realpath(path))
-    temporary = temporary_sibling(target)
-    unfinished.add(temporary)
-    try:
+    with _temporary(path) as (target, temporary):
         temporary.mkdir()
         yield temporary
         _sync_tree(temporary)
         _keep_mode(target, temporary)
         _swap_in(temporary, target)
+
+
+@contextlib.contextmanager
+def _temporary(path: Path | str) -> Iterator[tuple[Path, Path]]:
+    """Where a path leads and a new name beside it, of which nothing is left where the block fails; after it
+    the names are flushed."""
+    target = Path(os.path.realpath(path))
+    temporary = temporary_sibling(target)
+    unfinished.add(temporary)
+    try:
+        yield target, temporary
     except BaseException as error:
-        shutil.rmtree(temporary, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            _remove(temporary)
         _explain(error, path, temporary, target)
         raise
     finally:

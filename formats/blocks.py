@@ -13,7 +13,7 @@ import numpy as np
 from formats.graph import belongs, free_name, placement_of
 from formats.history import distilled, listed
 from formats.nodes import WHITE
-from formats.records import CodedSpec, FieldHeader, decode_header, encode_stored, mapped_array, member_name
+from formats.records import FieldHeader, decode_header, encode_stored, mapped_array, member_name
 from formats.scene import Box, Matrix4, Node, SceneGraph
 
 KIND = "vm"
@@ -136,7 +136,7 @@ def encode_tensor(data: bytes | memoryview, header: FieldHeader, number: int) ->
     """The bytes of a field that is one tensor of another, with the arrays that it has there."""
     tensor = header.metadata["tensors"][number]
     stored = {name: mapped_array(data, spec) for name, spec in own_arrays(header.specs, number)}
-    coded = {name: coded_entry(spec) for name, spec in own_arrays(header.coded, number)}
+    coded = {name: spec.entry for name, spec in own_arrays(header.coded, number)}
     needs = {"hashed"} if "hashed" in tensor else set()
     needs |= {word for word, ends in NEEDS.items() if any(name.endswith(ends) for name in stored)}
     block = {"name": "", "object_to_field": np.eye(4).tolist(), "tensor": 0}
@@ -150,11 +150,6 @@ def own_arrays(arrays: Mapping[str, object], number: int) -> Iterator[tuple[str,
     for name, array in arrays.items():
         if name.startswith(f"tensor_{number}."):
             yield f"tensor_0.{name.partition('.')[2]}", array
-
-
-def coded_entry(spec: CodedSpec) -> dict:
-    """What a field's header says of a coded array."""
-    return {"bits": spec.bits, "shape": list(spec.shape)} | ({"runs": True} if spec.runs else {})
 
 
 # -- the graph -----------------------------------------------------------------------------------------------

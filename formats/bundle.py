@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.archive import MAGIC, read_archive, write_archive
+from formats.archive import MAGIC, read_archive, sha256_of_bytes, write_archive
 from formats.atomic import atomic_writer, check_writable
 from formats.blocks import Instance, Unfolded, unfolded
 from formats.camera_set import read_camera_set
@@ -30,9 +30,7 @@ from formats.records import (
     decode_field,
     decode_header,
     encode_field,
-    mapped_array,
     member_name,
-    sha256_of_bytes,
 )
 from formats.safe_input import open_input
 from formats.scene import FORMAT, MEMBER, SceneGraph, dump_scene, parse_scene, read_scene
@@ -61,27 +59,27 @@ class FieldSet:
         instances: Mapping[str, tuple[Instance, ...]] | None = None,
     ):
         """views: their bytes, by member. path leads error sentences."""
-        self.path, self._views, self.instances = Path(path), dict(views), dict(instances or {})
+        self.path, self.views, self.instances = Path(path), dict(views), dict(instances or {})
         where = str(path)
         self.headers = {
             name: (headers or {}).get(name) or decode_header(data, f"{where}: {name}")
-            for name, data in self._views.items()
+            for name, data in self.views.items()
         }
 
     def with_fields(self, views: Mapping[str, bytes | memoryview]) -> "FieldSet":
         """These fields and others."""
-        return FieldSet(self.path, self._views | dict(views), self.headers, self.instances)
+        return FieldSet(self.path, self.views | dict(views), self.headers, self.instances)
 
     @property
     def copied(self) -> int:
         """Bytes of fields that lie in memory, not in the file alone: those of a version that is unfolded."""
-        return sum(len(data) for data in self._views.values() if isinstance(data, bytes))
+        return sum(len(data) for data in self.views.values() if isinstance(data, bytes))
 
     def data(self, member: str) -> bytes | memoryview:
         """A field's bytes. Raises MissingMember."""
         if member not in self.headers:
             raise MissingMember(f"{self.path}: holds no member {member!r}")
-        return self._views[member]
+        return self.views[member]
 
     def placed(self, member: str) -> tuple[Instance, ...]:
         """What a member stands for, which may have held several objects; nothing of one that is not here."""
@@ -92,12 +90,9 @@ class FieldSet:
         """One field. Raises MissingMember, and as `decode_field`."""
         record = decode_field(self.data(member), f"{self.path}: {member}")
         for part, name in shared_members(member, record, self.headers, str(self.path)).items():
-            _take_part(record, part, decode_field(self._views[name], f"{self.path}: {name}"))
+            shared = decode_field(self.views[name], f"{self.path}: {name}")
+            record.arrays.update({f"{part}.{key}": array for key, array in shared.arrays.items()})
         return record
-
-    def array(self, member: str, name: str) -> np.ndarray:
-        """One array of a field as it is stored, read-only. Raises MissingMember and KeyError."""
-        return mapped_array(self.data(member), self.headers[member].specs[name])
 
 
 class OpenBundle(FieldSet):
@@ -144,7 +139,8 @@ class BundleWriter:
         """
         if SHARED in record.metadata:
             record = self._with_parts_apart(record, precision)
-        name, data = field_member(record, precision)
+        data = encode_field(record, precision)
+        name = member_name(data)
         self.members[name] = data
         return name
 
@@ -188,12 +184,6 @@ class BundleWriter:
             write_archive(file, members)
 
 
-def field_member(record: FieldRecord, precision: str = "float16") -> tuple[str, bytes]:
-    """The member name and bytes of one field."""
-    data = encode_field(record, precision)
-    return member_name(data), data
-
-
 def read_bundle(path: Path | str, *, verify: bool = True) -> Bundle:
     """The bundle at `path`, every byte of it checked; without `verify` the checksums are not.
 
@@ -208,11 +198,6 @@ def read_headers(path: Path | str, *, verify: bool = True) -> tuple[SceneGraph, 
     """
     bundle = OpenBundle(path, verify=verify)
     return bundle.scene, bundle.headers
-
-
-def _take_part(record: FieldRecord, part: str, shared: FieldRecord) -> None:
-    """Give a field the arrays of a part that it shares, as PART.NAME."""
-    record.arrays.update({f"{part}.{key}": array for key, array in shared.arrays.items()})
 
 
 def shared_members(
@@ -235,24 +220,27 @@ def read_summary(path: Path | str) -> dict:
     Boxes are (6,) lists: `aabb` in the object's frame, `world_aabb` the box around its eight placed corners.
     `objects` are what a fused field was made of (formats/object_summary.py); a plain scene has nodes alone.
     """
-    if _is_json(path):
-        return summary_of(read_scene(path), str(path), _size(path))
+    with open_input(path) as file:
+        is_json = file.read(64).lstrip()[:1] == b"{"
+    if is_json:
+        return summary_of(read_scene(path), str(path), Path(path).stat().st_size)
     views = read_archive(path)
     read = _unfolded(views, str(path), verify=False)
-    fields = [_field_summary(name, header) for name, header in sorted(read.headers.items())]
+    # The size of the file that was mapped: the path may name another file by now.
+    return summary_of(read.scene, str(path), len(views[SCENE].obj), read.headers)
+
+
+def summary_of(
+    scene: SceneGraph, path: str, size: int, headers: dict[str, FieldHeader] | None = None
+) -> dict:
+    """`read_summary` of a scene that was read from `path`, in so many bytes; headers: those of a bundle."""
     return {
-        "path": str(path),
-        "format": FORMAT,
-        # The size of the file that was mapped: the path may name another file by now.
-        "bytes": len(views[SCENE].obj),
-        **_scene_summary(read.scene, read.headers),
-        "fields": fields,
+        "path": path,
+        "format": "scene" if headers is None else FORMAT,
+        "bytes": size,
+        **_scene_summary(scene, headers or {}),
+        "fields": [_field_summary(name, header) for name, header in sorted((headers or {}).items())],
     }
-
-
-def summary_of(scene: SceneGraph, path: str, size: int) -> dict:
-    """`read_summary` of a scene that was read from `path`, in so many bytes."""
-    return {"path": path, "format": "scene", "bytes": size, **_scene_summary(scene, {}), "fields": []}
 
 
 def is_bundle(path: Path | str) -> bool:
@@ -281,35 +269,30 @@ def check_fields(scene: SceneGraph, members: Iterable[str], where: str) -> None:
 
 
 def _bundle(views: dict[str, memoryview], where: str, verify: bool) -> Bundle:
-    scene = _scene(views, where)
-    members = _checked_members(views, where, verify)
-    check_fields(scene, members, where)
-    fields = {name: decode_field(view, f"{where}: {name}") for name, view in members.items()}
-    for member, record in fields.items():
-        for part, name in shared_members(member, record, fields, where).items():
-            _take_part(record, part, fields[name])
-    return Bundle(scene, fields)
+    scene, fields = _scene_and_fields(views, where, verify)
+    return Bundle(scene, {name: fields.field(name) for name in fields.headers})
 
 
 def _unfolded(views: dict[str, memoryview], where: str, verify: bool) -> Unfolded:
     """The scene, and the headers of its fields."""
-    scene = _scene(views, where)
-    members = _checked_members(views, where, verify)
-    check_fields(scene, members, where)
-    headers = {name: decode_header(view, f"{where}: {name}") for name, view in members.items()}
-    for member, header in headers.items():
-        shared_members(member, header, headers, where)
+    scene, fields = _scene_and_fields(views, where, verify)
+    for member, header in fields.headers.items():
+        shared_members(member, header, fields.headers, where)
     try:
-        return unfolded(scene, members, headers)
+        return unfolded(scene, fields.views, fields.headers)
     except FormatError as error:
         raise error.within(where) from error
 
 
-def _scene(views: dict[str, memoryview], where: str) -> SceneGraph:
+def _scene_and_fields(views: dict[str, memoryview], where: str, verify: bool) -> tuple[SceneGraph, FieldSet]:
+    """What a bundle stores; the scene comes first, which says where a newer version is needed."""
     first = next(iter(views))
     if first != SCENE:
         raise UnknownMember(f"{where}: begins with member {first!r}, expected {SCENE!r}")
-    return parse_scene(bytes(views[SCENE]), f"{where}: {SCENE}")
+    scene = parse_scene(bytes(views[SCENE]), f"{where}: {SCENE}")
+    members = _checked_members(views, where, verify)
+    check_fields(scene, members, where)
+    return scene, FieldSet(where, members)
 
 
 def _checked_members(views: dict[str, memoryview], where: str, verify: bool) -> dict[str, memoryview]:
@@ -323,15 +306,6 @@ def _checked_members(views: dict[str, memoryview], where: str, verify: bool) -> 
     if names != sorted(names):
         raise BadHeader(f"{where}: its members are not sorted by name; write it with fusedrf")
     return {name: views[name] for name in names}
-
-
-def _is_json(path: Path | str) -> bool:
-    with open_input(path) as file:
-        return file.read(64).lstrip()[:1] == b"{"
-
-
-def _size(path: Path | str) -> int:
-    return Path(path).stat().st_size
 
 
 def _scene_summary(scene: SceneGraph, headers: dict[str, FieldHeader]) -> dict:

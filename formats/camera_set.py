@@ -16,6 +16,7 @@ from formats.capture_frame import scene_frame
 from formats.errors import BadSchema
 from formats.images import MAX_SIDE
 from formats.names import distinct_names, is_name
+from formats.nodes import QUATERNION_SLACK
 from formats.rotations import matrices, quaternions
 from formats.upright import upward
 from formats.views import FARTHEST, NO_DISTORTION, Capture, View
@@ -26,7 +27,6 @@ LARGEST = 1e9
 DIGITS = 8
 """Decimals of a quaternion, and of a position counted in distances to the focus: at a focal length of 10,000
 pixels less than a thousandth of a pixel."""
-QUATERNION_SLACK = 1e-2
 SIMILAR = 1e-4
 """How far from a rotation and one scale a placement may be that cameras go along with."""
 INNER = 6

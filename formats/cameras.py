@@ -9,13 +9,15 @@ import json
 import math
 import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from formats.errors import BadIntrinsics, BadJson, BadSchema, LimitExceeded, NoViews, UnsupportedCamera
 from formats.images import MAX_SIDE, read_image_header
+from formats.matching import Listings
 from formats.names import distinct_names
 from formats.other_files import foreign_json
-from formats.photos import find_photo, split_ending
+from formats.photos import split_ending
 from formats.safe_input import decoded, read_input
 from formats.views import View, checked_pose
 
@@ -23,7 +25,7 @@ MAX_JSON = 256 * 2**20
 PERSPECTIVE = {"", "PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV"}
 RATIONAL = "FULL_OPENCV"
 FISHEYE = {"FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"}
-BENDS = ("k1", "k2", "k3", "p1", "p2")
+BENDS, FISHEYE_BENDS = ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
 RATIONAL_BENDS = ("k4", "k5", "k6")
 SMALL = 16
 """Pixels a side of pictures so small that a centre of less than one pixel may be meant."""
@@ -103,11 +105,6 @@ def read_frames(path: Path, document: dict, key: str = "frames") -> list[dict]:
     return [frame if isinstance(frame, dict) else {} for frame in frames]
 
 
-def frame_photo(path: Path, frame: dict) -> Path | None:
-    """The frame's photo, under the extension it has on disk; None if it is not there."""
-    return find_photo(path.parent, frame_file(frame))
-
-
 def frame_file(frame: dict) -> str:
     """The frame's `file_path` with forward slashes and without a leading "./"; empty where there is none."""
     return written_path(frame, "file_path")
@@ -119,9 +116,9 @@ def written_path(keys: dict, key: str) -> str:
     return str(PurePosixPath(written.replace("\\", "/"))) if isinstance(written, str) and written else ""
 
 
-def frame_names(frames: list[dict]) -> list[str]:
-    """A distinct name per frame: the file stem, or the path joined by _ where two frames share a stem."""
-    files = [PurePosixPath(frame_file(frame) or f"{i:05d}") for i, frame in enumerate(frames)]
+def frame_names(files: Sequence[str]) -> list[str]:
+    """A distinct name per file: its stem, or the path joined by _ where two share a stem."""
+    files = [PurePosixPath(file or f"{i:05d}") for i, file in enumerate(files)]
     stems = [split_ending(file.name)[0] for file in files]
     shared = Counter(stems)
     names = [
@@ -143,26 +140,14 @@ def frame_view(where: str, document: dict, frame: dict, name: str, size: tuple[i
         raise BadIntrinsics(
             f"{where}: no focal length; expected fl_x, x_fov or camera_angle_x here or in the file"
         )
-    cx, cy = _number(sources, "cx", where, width / 2), _number(sources, "cy", where, height / 2)
+    cx, cy = stated_number(sources, "cx", where, width / 2), stated_number(sources, "cy", where, height / 2)
     if min(width, height) > SMALL and 0 < cx <= 1 and 0 < cy <= 1:
         raise BadIntrinsics(
             f"{where}: cx and cy are {cx:g} and {cy:g}, shares of the picture; give cx, cy, fl_x and fl_y in "
             "pixels"
         )
     pose, repair = checked_pose(frame.get("transform_matrix"), where)
-    return View(
-        name=name,
-        camera_to_world=pose,
-        fl_x=x or y,
-        fl_y=y or x,
-        cx=cx,
-        cy=cy,
-        width=width,
-        height=height,
-        distortion=distortion,
-        fisheye=fisheye,
-        repair=repair,
-    )
+    return View(name, pose, x or y, y or x, cx, cy, width, height, distortion, fisheye, repair=repair)
 
 
 def frame_where(path: Path, index: int, frame: dict) -> str:
@@ -172,15 +157,18 @@ def frame_where(path: Path, index: int, frame: dict) -> str:
 
 def _frame_views(path: Path, document: dict, size: tuple[int, int] | None) -> tuple[View, ...]:
     frames = read_frames(path, document)
-    first_photo = next((photo for photo in (frame_photo(path, frame) for frame in frames) if photo), None)
+    listings, files = Listings(), [frame_file(frame) for frame in frames]
+    paths = (path.parent / file for file in files if file)
+    photos = (at.with_name(name) for at in paths for _, name in listings.find(at.parent, at.name))
+    first_photo = next(photos, None)
     photo_size = read_image_header(first_photo)[:2] if first_photo else size
-    named = enumerate(zip(frames, frame_names(frames), strict=True))
+    named = enumerate(zip(frames, frame_names(files), strict=True))
     views = [frame_view(frame_where(path, i, f), document, f, name, photo_size) for i, (f, name) in named]
     return tuple(view.reframed(*size) if size else view for view in views)
 
 
 def _size(sources: tuple[dict, dict], size: tuple[int, int] | None, where: str) -> tuple[int, int]:
-    stated = [_number(sources, key, where, None) for key in ("w", "h")]
+    stated = [stated_number(sources, key, where, None) for key in ("w", "h")]
     width, height = (round(side) for side in stated) if None not in stated else size or (None, None)
     if width is None:
         raise BadIntrinsics(
@@ -199,11 +187,11 @@ def checked_size(width: int, height: int, where: str) -> tuple[int, int]:
 def _focal(sources: tuple[dict, dict], axis: str, side: int, where: str) -> float | None:
     """Pixels; None where neither source says."""
     for source in sources:
-        if (degrees := _number((source,), f"{axis}_fov", where, None)) is not None:
+        if (degrees := stated_number((source,), f"{axis}_fov", where, None)) is not None:
             return fov_focal(math.radians(degrees), side, where)
-        if (pixels := _number((source,), f"fl_{axis}", where, None)) is not None:
+        if (pixels := stated_number((source,), f"fl_{axis}", where, None)) is not None:
             return checked_focal(pixels, where)
-        if (radians := _number((source,), f"camera_angle_{axis}", where, None)) is not None:
+        if (radians := stated_number((source,), f"camera_angle_{axis}", where, None)) is not None:
             return fov_focal(radians, side, where)
     return None
 
@@ -226,7 +214,8 @@ def checked_focal(pixels: float, where: str) -> float:
     return pixels
 
 
-def _number(sources: tuple[dict, ...], key: str, where: str, default: float | None) -> float | None:
+def stated_number(sources: tuple[dict, ...], key: str, where: str, default: float | None) -> float | None:
+    """What the first source that knows it says, a finite number; else the default."""
     number = next((source[key] for source in sources if source.get(key) is not None), default)
     if number is None:
         return None
@@ -246,13 +235,13 @@ def _lens(sources: tuple[dict, dict], where: str) -> tuple[bool, tuple[float, ..
     where it divides.
     """
     model = str(next((source["camera_model"] for source in sources if "camera_model" in source), "")).upper()
-    numbers = {key: _number(sources, key, where, 0.0) for key in (*BENDS, *RATIONAL_BENDS)}
+    numbers = {key: stated_number(sources, key, where, 0.0) for key in (*BENDS, *RATIONAL_BENDS)}
     if model in FISHEYE or any(source.get("is_fisheye") for source in sources):
         if numbers["p1"] or numbers["p2"]:
             raise UnsupportedCamera(
                 f"{where}: a fisheye with p1 or p2, expected k1 to k4; undistort the photos"
             )
-        return True, tuple(numbers[key] for key in ("k1", "k2", "k3", "k4"))
+        return True, tuple(numbers[key] for key in FISHEYE_BENDS)
     if model not in PERSPECTIVE | {RATIONAL}:
         raise UnsupportedCamera(
             f"{where}: a camera with {model[:40]}, expected a pinhole or a fisheye with OpenCV's distortion; "
@@ -272,7 +261,9 @@ def _path_views(path: Path, document: dict, size: tuple[int, int] | None) -> tup
     if kind != "perspective":
         raise UnsupportedCamera(f"{path}: camera_type {kind[:40]!r}, expected perspective")
     if not size:
-        sides = [_number((document,), f"render_{side}", str(path), None) for side in ("width", "height")]
+        sides = [
+            stated_number((document,), f"render_{side}", str(path), None) for side in ("width", "height")
+        ]
         if None in sides:
             raise BadIntrinsics(f"{path}: no render_width and render_height; give the size of the pictures")
         size = checked_size(*(round(side) for side in sides), str(path))
@@ -283,7 +274,7 @@ def _path_views(path: Path, document: dict, size: tuple[int, int] | None) -> tup
 def _path_view(where: str, frame: dict, name: str, size: tuple[int, int]) -> View:
     """nerfstudio's `fov` is the vertical one, in degrees."""
     width, height = size
-    degrees = _number((frame,), "fov", where, None)
+    degrees = stated_number((frame,), "fov", where, None)
     if degrees is None:
         raise BadIntrinsics(f"{where}: no fov; expected the vertical field of view in degrees")
     focal = fov_focal(math.radians(degrees), height, where)

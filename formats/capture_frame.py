@@ -21,6 +21,8 @@ SHOWN = 0.98
 """Share of the sparse points that a default box holds."""
 OUTLIERS = 0.001
 """Share of a view's points that may lie nearer than its `near`, and farther than its `far`."""
+BORDER = 0.02
+"""Share of the longest side of what is shown that a box reaches beyond it."""
 MARGIN = 1.25
 """Factor on the extent of the sparse points, since other parts of the scene may reach farther."""
 
@@ -80,7 +82,7 @@ def _spread(looks: np.ndarray) -> float:
 def _crossings(eyes: np.ndarray, looks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The point nearest to both axes (P, 3) of the pairs that cross at an angle, and whether it lies before
     both cameras (P,)."""
-    chosen = np.unique(np.linspace(0, len(eyes) - 1, min(len(eyes), PAIRS_FROM)).astype(int))
+    chosen = evenly(len(eyes), PAIRS_FROM)
     eyes, looks = eyes[chosen], looks[chosen]
     i, j = np.triu_indices(len(eyes), 1)
     cosine = np.einsum("pk,pk->p", looks[i], looks[j])
@@ -121,11 +123,24 @@ def default_box(frame: SceneFrame, poses: np.ndarray, points: np.ndarray | None)
     return np.concatenate([frame.focus - reach * unit, frame.focus + reach * unit])
 
 
-def shown_box(corners: np.ndarray) -> np.ndarray:
-    """(6,) box of (N, 3) corners of what forward-facing cameras show, and a little more."""
-    low, high = corners.min(0), corners.max(0)
-    margin = 0.02 * (high - low).max()
+def box_around(points: np.ndarray) -> np.ndarray:
+    """(6,) box of (N, 3) points, and BORDER of its longest side more."""
+    low, high = points.min(0), points.max(0)
+    margin = BORDER * (high - low).max()
     return np.concatenate([low - margin, high + margin])
+
+
+def evenly(count: int, most: int) -> np.ndarray:
+    """At most so many of 0 to count - 1, evenly spaced, rising."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
+
+
+def sphere(count: int) -> np.ndarray:
+    """(count, 3) unit vectors, evenly spaced on a sphere along a spiral, the highest first."""
+    step = np.arange(count)
+    z, turn = 1 - (2 * step + 1) / max(count, 1), step * np.pi * (3 - 5**0.5)
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], 1)
 
 
 def depth_range(pose: np.ndarray, points: np.ndarray) -> tuple[float | None, float | None]:

@@ -6,17 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.capture_frame import default_box, scene_frame, shown_box
+from formats.capture_frame import box_around, default_box, scene_frame
 from formats.errors import NoViews, printable
+from formats.frame_list import SplitPart
 from formats.masks import with_masks_beside
-from formats.photos import (
-    alike_turned,
-)
+from formats.photos import alike_turned
 from formats.points import SparsePoints
 from formats.silhouettes import AMISS, AMISS_ON_WHITE, by_alpha, by_ground, by_masks, outline_box
-from formats.transforms import (
-    SplitPart,
-)
 from formats.upright import upward_doubt
 from formats.views import LEAST_VIEWS, Capture, View
 
@@ -98,4 +94,4 @@ def _surroundings(views: tuple[View, ...], poses: np.ndarray, points: SparsePoin
     if frame.layout != "forward-facing":
         return frame, default_box(frame, poses, None if points is None else points.positions)
     seen = [(view, view.near or 0.5 * frame.distance, view.far or 4 * frame.distance) for view in views]
-    return frame, shown_box(np.concatenate([view.corners(d) for view, *ends in seen for d in ends]))
+    return frame, box_around(np.concatenate([view.corners(d) for view, *ends in seen for d in ends]))

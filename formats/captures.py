@@ -10,18 +10,19 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from formats import colmap, llff, opensfm, polycam
 from formats.atomic import atomic_writer
-from formats.cameras import frame_names, read_cameras, read_document
+from formats.cameras import BENDS, FISHEYE_BENDS, read_document
 from formats.capture_of import capture_of
 from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NotACapture, NoViews, printable
-from formats.frame_list import read_sound, repair_notes
+from formats.frame_list import SplitPart, read_listed, read_sound, repair_notes
 from formats.images import read_image_header, write_png
-from formats.matching import PHOTO_FOLDERS, gone, match_photos
+from formats.matching import PHOTO_FOLDERS, gone
 from formats.meshes import is_mesh, mesh_capture
 from formats.other_files import is_json, not_a_capture, other_cameras
 from formats.photos import (
@@ -33,44 +34,25 @@ from formats.photos import (
     is_file,
     is_hidden,
     is_picture,
-    load_ignored,
-    load_images,
-    load_photos,
     natural,
     on_photo,
     pictures,
+    visible_files,
 )
 from formats.pose_files import PoseFiles, pose_files, read_box, read_lens, read_view, splits
 from formats.transforms import (
     BLENDER_FILE,
-    SplitPart,
-    read_part,
     read_splits,
     sparse_points,
     stated_aabb,
 )
-from formats.views import Capture, View, hold_out
+from formats.views import Capture, View
 
 LEVELS, MAX_FOLDERS = 3, 500
 """How deep captures are looked for below a folder without poses, and in how many folders of one depth."""
 
 CAMERAS = "cams"
 """A folder of cameras that are not read, as MVSNet has one."""
-
-__all__ = [
-    "Capture",
-    "View",
-    "hold_out",
-    "is_capture",
-    "is_mesh",
-    "load_ignored",
-    "load_images",
-    "load_photos",
-    "read_cameras",
-    "read_capture",
-    "write_cameras",
-    "write_capture",
-]
 
 
 def is_capture(path: Path | str) -> bool:
@@ -88,14 +70,7 @@ def is_capture(path: Path | str) -> bool:
 
 def _has_poses(path: Path) -> bool:
     """Whether cameras lie in a folder as one of the layouts has them."""
-    return (
-        any(path.glob("transforms*.json"))
-        or colmap.model_folder(path) is not None
-        or is_file(path / llff.NAME)
-        or polycam.keyframes(path) is not None
-        or pose_files(path) is not None
-        or opensfm.reconstruction(path) is not None
-    )
+    return any(path.glob("transforms*.json")) or _layout(path) is not None
 
 
 def _captures_below(path: Path) -> list[Path]:
@@ -157,32 +132,32 @@ def read_capture(path: Path | str, downscale: int | None = None) -> Capture:
     return _read_transforms(path, downscale)
 
 
-def _read_folder(path: Path, downscale: int | None) -> Capture:
+def _layout(path: Path) -> Callable[[int | None], Capture] | None:
+    """What reads the poses in a folder, at a scale, by its layout; None where none lie there."""
     train, val, test, single = (path / f"transforms{split}.json" for split in ("_train", "_val", "_test", ""))
     if train.exists() or val.exists():
         known = train if train.exists() else val
-        return _read_blender(path, downscale, known, test if test.exists() else None)
+        return partial(_read_blender, path, train=known, test=test if test.exists() else None)
     if single.exists():
-        return _read_transforms(single, downscale)
+        return partial(_read_transforms, single)
     if test.exists():
-        return _read_blender(path, downscale, test=test)
+        return partial(_read_blender, path, test=test)
     if (model := colmap.model_folder(path)) is not None:
-        try:
-            return _read_colmap(path, model, downscale)
-        except MissingFile as error:
-            # The smaller copies of LLFF's scenes have other names than COLMAP's model of them.
-            if not is_file(path / llff.NAME):
-                raise
-            capture = _read_llff(path / llff.NAME, downscale)
-            return replace(capture, notes=(f"{error}; {llff.NAME} is read instead", *capture.notes))
+        return partial(_read_colmap, path, model)
     if is_file(path / llff.NAME):
-        return _read_llff(path / llff.NAME, downscale)
+        return partial(_read_llff, path / llff.NAME)
     if (places := polycam.keyframes(path)) is not None:
-        return _read_polycam(path, *places, downscale)
+        return partial(_read_polycam, path, *places)
     if (files := pose_files(path)) is not None:
-        return _read_pose_files(path, files, downscale)
+        return partial(_read_pose_files, path, files)
     if (file := opensfm.reconstruction(path)) is not None:
-        return _read_opensfm(path, file, downscale)
+        return partial(_read_opensfm, path, file)
+    return None
+
+
+def _read_folder(path: Path, downscale: int | None) -> Capture:
+    if (read := _layout(path)) is not None:
+        return read(downscale)
     if len(below := list(path.glob("*/transforms.json"))) == 1:
         return _read_transforms(below[0], downscale, path)
     below = _captures_below(path)
@@ -213,17 +188,15 @@ def _read_below(path: Path, below: Path, downscale: int | None) -> Capture:
 def _read_blender(
     path: Path, downscale: int | None, train: Path | None = None, test: Path | None = None
 ) -> Capture:
-    first = train or test
-    parts, notes = [read_part(first, downscale)], ()
+    first, notes = train or test, ()
+    document, part, _ = read_splits(first, first.parent, downscale)
+    parts = [part, SplitPart()] if train else [SplitPart(), part]
     if train and test:
         try:
-            parts.append(read_part(test, downscale))
+            parts[1] = read_splits(test, test.parent, downscale)[1]
         except NoViews as error:
-            parts.append(SplitPart())
             notes = (f"{error}; none are held out by it",)
-    parts = [*parts, SplitPart()] if train else [SplitPart(), *parts]
-    stated = stated_aabb(first, read_document(first))
-    return capture_of(path, "blender", *parts[:2], stated=stated, notes=notes)
+    return capture_of(path, "blender", *parts, stated_aabb(first, document), notes=notes)
 
 
 def _read_transforms(path: Path, downscale: int | None, base: Path | None = None) -> Capture:
@@ -242,8 +215,12 @@ def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
     try:
         notes = (*others, *model.notes)
         return _read_model(path, "colmap", model, base, (*colmap.PHOTOS_IN, ""), downscale, notes)
-    except MissingFile as error:
-        raise MissingFile("; ".join([str(error), *others])) from error
+    except NoViews as error:
+        # The smaller copies of LLFF's scenes have other names than COLMAP's model of them.
+        if not is_file(path / llff.NAME):
+            raise NoViews("; ".join([str(error), *others])) from error
+        capture = _read_llff(path / llff.NAME, downscale)
+        return replace(capture, notes=(f"{error}; {llff.NAME} is read instead", *capture.notes))
 
 
 def _read_model(
@@ -257,44 +234,10 @@ def _read_model(
 ) -> Capture:
     """A model whose photos lie in one of `homes` in the folder `base`."""
     images = [(image.name.replace("\\", "/"), image) for image in model.images]
-    part = _read_listed(
-        model.folder, base, images, lambda image, size: (image.where, image.view), downscale, homes
+    parts = read_listed(
+        model.folder, base, [images], lambda image, *_: (image.where, image.view, None), downscale, homes
     )
-    return capture_of(path, kind, part, SplitPart(), None, model.points, tuple(notes))
-
-
-def _read_listed(
-    where: Path,
-    base: Path,
-    listed: Sequence[tuple[str, object]],
-    camera: Callable[[object, tuple[int, int]], tuple[str, View]],
-    downscale: int | None,
-    homes: Sequence[str] = ("",),
-) -> SplitPart:
-    """The photos of names, with what stands for each; `camera` makes of this and the photo's size how errors
-    name it, and its view. `where` lists them, and the photos lie in one of `homes` in `base`."""
-    matched = match_photos(where, base, [file for file, _ in listed], downscale, homes)
-    if not matched.photos:
-        named = min((file for file, _ in listed), key=natural)
-        raise MissingFile(
-            f"{where}: names {len(listed)} photos such as {named}, but none of them is there: {matched.hint}"
-        )
-    items = sorted((item for item in listed if item[0] in matched.photos), key=lambda item: natural(item[0]))
-    names = frame_names([{"file_path": file} for file, _ in items])
-
-    def read(numbered: tuple[int, tuple]) -> View:
-        i, (file, item) = numbered
-        photo, folder = matched.photos[file]
-        header = read_image_header(photo)
-        camera_where, view = camera(item, header[:2])
-        view = replace(view, name=names[i])
-        return on_photo(view, photo, header, camera_where, reduction=folder.reduction(header, downscale))
-
-    views, broken = read_sound(
-        where, list(enumerate(items)), read, lambda item: str(matched.photos[item[1][0]][0])
-    )
-    notes = (*matched.notes, *broken, *repair_notes(where, views))
-    return SplitPart(tuple(views), matched.missing, notes)
+    return capture_of(path, kind, *parts, SplitPart(), None, model.points, tuple(notes))
 
 
 def _other_models(path: Path, folder: Path) -> list[str]:
@@ -347,31 +290,30 @@ def _counted(images: Path, count: int, downscale: int | None) -> Folder | None:
 
 
 def _read_polycam(path: Path, images: Path, cameras: Path, downscale: int | None) -> Capture:
-    files = [(file.stem, file) for file in polycam.camera_files(cameras)]
-    part = _read_listed(
-        cameras, images, files, lambda file, size: (str(file), polycam.read_camera(file, size)), downscale
+    listed = [(file.stem, file) for file in visible_files(cameras, ".json")]
+    parts = read_listed(
+        cameras,
+        images,
+        [listed],
+        lambda file, header, _: (str(file), polycam.read_camera(file, header[:2]), None),
+        downscale,
     )
     photos, poses = polycam.FOLDERS[0]
     lost = images.name != photos and (images.parent / poses).is_dir()
     uncorrected = [f"{images.parent}: {poses} is not used, since there is no {photos}"] if lost else []
-    return capture_of(path, "polycam", part, SplitPart(), None, notes=tuple(uncorrected))
+    return capture_of(path, "polycam", *parts, SplitPart(), None, notes=tuple(uncorrected))
 
 
 def _read_pose_files(path: Path, files: PoseFiles, downscale: int | None) -> Capture:
     lens, notes = read_lens(files)
     *names, unused = splits(list(files.poses))
-    parts = [
-        _read_listed(
-            files.folder,
-            files.photos,
-            [(name, files.poses[name]) for name in part],
-            lambda file, size: (str(file), read_view(file, lens, size)),
-            downscale,
-        )
-        if part
-        else SplitPart()
-        for part in names
-    ]
+    parts = read_listed(
+        files.folder,
+        files.photos,
+        [[(name, files.poses[name]) for name in split] for split in names],
+        lambda file, header, _: (str(file), read_view(file, lens, header[:2]), None),
+        downscale,
+    )
     notes += [f"{path}: {unused}"] if unused else []
     return capture_of(path, "pose files", *parts, read_box(files), notes=tuple(notes))
 
@@ -427,13 +369,13 @@ def _intrinsics(view: View, more: bool) -> dict:
     keys = ("fl_x", "fl_y", "cx", "cy")
     inner = {key: getattr(view, key) for key in keys} | {"w": view.width, "h": view.height}
     if view.fisheye:
-        model, bends = "OPENCV_FISHEYE", dict(zip(("k1", "k2", "k3", "k4"), view.distortion, strict=True))
+        model, bends = "OPENCV_FISHEYE", dict(zip(FISHEYE_BENDS, view.distortion, strict=True))
     else:
         *low, k4, d1, d2, d3 = (*view.distortion, *(0.0,) * (9 - len(view.distortion)))
-        bends = dict(zip(("k1", "k2", "k3", "p1", "p2"), low, strict=True))
+        bends = dict(zip(BENDS, low, strict=True))
         model = "FULL_OPENCV" if d1 or d2 or d3 else "OPENCV"
         bends |= {"k4": d1, "k5": d2, "k6": d3} if model == "FULL_OPENCV" else {"k4": k4}
-    bends = dict.fromkeys(("k1", "k2", "k3", "p1", "p2"), 0.0) | bends
+    bends = dict.fromkeys(BENDS, 0.0) | bends
     if not more:
         return inner | {key: value for key, value in bends.items() if key != "k4"}
     return {**inner, "camera_model": model, **dict.fromkeys(("k4", "k5", "k6"), 0.0), **bends}

@@ -10,11 +10,12 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from formats.cameras import MOST_PIXELS, checked_focal, checked_size
+from formats.cameras import BENDS, FISHEYE_BENDS, MOST_PIXELS, checked_focal, checked_size
 from formats.capture_frame import depth_range
 from formats.colmap_points import ListedPoints, binary_points, text_points
 from formats.colmap_text import check_count, number, numbered_lines, pose_number
@@ -23,19 +24,18 @@ from formats.errors import (
     BadModel,
     BadPose,
     FormatError,
-    ResourceError,
     UnsupportedCamera,
+    noted,
 )
 from formats.frame_list import once, read_sound
 from formats.matching import stem_key
 from formats.photos import folders
 from formats.points import MAX_POINTS, SparsePoints, points_notes
 from formats.rotations import matrices
-from formats.safe_input import open_input, read_input
+from formats.safe_input import MAX_BYTES, open_input, read_input
 from formats.views import FARTHEST, View
 
 MAX_CAMERAS_BYTES = 64 * 2**20
-MAX_BYTES = 2**31
 MAX_NAME = 4096
 MODELS = {
     "SIMPLE_PINHOLE": "f cx cy",
@@ -52,20 +52,11 @@ MODELS = {
 }
 """Parameters of the models that can be rendered, in COLMAP's order. FULL_OPENCV's last three are OpenCV's k4,
 k5 and k6."""
-NUMBERS = [
-    *(
-        "SIMPLE_PINHOLE",
-        "PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "OPENCV",
-        "OPENCV_FISHEYE",
-        "FULL_OPENCV",
-        "FOV",
-    ),
-    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
-    *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
-]
+NUMBERS = (
+    "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV OPENCV_FISHEYE FULL_OPENCV FOV SIMPLE_RADIAL_FISHEYE "
+    "RADIAL_FISHEYE THIN_PRISM_FISHEYE RAD_TAN_THIN_PRISM_FISHEYE SIMPLE_DIVISION DIVISION SIMPLE_FISHEYE "
+    "FISHEYE EUCM EQUIRECTANGULAR"
+).split()
 """Names of the models by their number in binary files."""
 MODELS_IN = ("sparse", "colmap")
 """Folders that models lie in, in the folder of their capture."""
@@ -127,7 +118,7 @@ def image_count(folder: Path) -> int:
                 count, size = int.from_bytes(file.read(8), "little"), os.fstat(file.fileno()).st_size
             return count if count <= size // SMALLEST_IMAGE else 0
         path = folder / "images.txt"
-        return len(_text_images(path, read_input(path, MAX_BYTES)))
+        return len(_text_images(path, read_input(path)))
     except (FormatError, OSError):
         return 0
 
@@ -156,12 +147,9 @@ def read_model(folder: Path, most_points: int = MAX_POINTS) -> Model:
     listed = _images(folder)
     if not listed:
         raise BadModel(f"{folder}: its images file is empty; export the model again")
-    try:
-        points, notes = _points(folder, most_points), []
-    except ResourceError:
-        raise
-    except FormatError as error:
-        points, notes = None, [f"{error}; the model is read without its points"]
+    points, notes = None, []
+    with noted(notes, "the model is read without its points"):
+        points = _points(folder, most_points)
 
     def read(listing: tuple) -> Image:
         where, name, quaternion, translation, camera, seen = listing
@@ -177,18 +165,14 @@ def read_model(folder: Path, most_points: int = MAX_POINTS) -> Model:
             view = replace(view, near=near, far=far, seen=points.sure(indices))
         return Image(name, where, view)
 
-    listed, repeated = once(folder, listed, _listed_name, lambda item: (*item[2], *item[3]))
-    images, broken = read_sound(folder, listed, read, _listed_name)
+    listed, repeated = once(folder, listed, itemgetter(1), lambda item: (*item[2], *item[3]))
+    images, broken = read_sound(folder, listed, read, itemgetter(1))
     notes = (*repeated, *broken, *notes, *points_notes(folder, points and points.points))
     return Model(folder, tuple(images), points and points.points, notes)
 
 
-def _listed_name(listing: tuple) -> str:
-    return listing[1]
-
-
 def _images(folder: Path) -> list[tuple]:
-    return _read(folder, "images", {"bin": _binary_images, "txt": _text_images}, MAX_BYTES)
+    return _read(folder, "images", {"bin": _binary_images, "txt": _text_images})
 
 
 def read_points(folder: Path, most: int = MAX_POINTS) -> tuple[SparsePoints | None, dict[str, np.ndarray]]:
@@ -206,10 +190,10 @@ def _points(folder: Path, most: int) -> ListedPoints | None:
     if not _has(folder, "points3D"):
         return None
     parsers = {"bin": partial(binary_points, most), "txt": partial(text_points, most)}
-    return _read(folder, "points3D", parsers, MAX_BYTES)
+    return _read(folder, "points3D", parsers)
 
 
-def _read(folder: Path, name: str, parsers: dict, limit: int):
+def _read(folder: Path, name: str, parsers: dict, limit: int = MAX_BYTES):
     ending = "bin" if (folder / f"{name}.bin").is_file() else "txt"
     path = folder / f"{name}.{ending}"
     data = read_input(path, limit)
@@ -257,7 +241,7 @@ def _camera(where: str, model: str, width: int, height: int, numbers) -> View:
         checked_focal(focal, where)
     checked_size(width, height, where)
     fisheye = "FISHEYE" in model
-    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3", "p1", "p2", "k4", "d1", "d2", "d3")
+    keys = FISHEYE_BENDS if fisheye else (*BENDS, "k4", "d1", "d2", "d3")
     bends = tuple(parameters.get(key, 0.0) for key in keys)
     if not fisheye and not any(bends[5:]):
         bends = bends[:5]

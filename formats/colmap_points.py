@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.colmap_text import check_count, number, numbered_lines
-from formats.errors import (
-    BadModel,
-)
+from formats.errors import BadModel
 from formats.points import SparsePoints, stride
 
 MOST_ERROR = 1.5
@@ -47,25 +45,19 @@ def binary_points(most: int, path: Path, data: bytes, block: int = 1 << 16) -> L
     (count,) = struct.unpack_from("<Q", data)
     check_count(path, count, len(data), HEAD.itemsize)
     step, at, track = stride(count, most), 8, struct.Struct("<Q").unpack_from
-    heads, kept = np.empty(-(-count // step), HEAD), []
+    starts = np.empty(-(-count // step), np.int64)
     for i in range(count):
         (length,) = track(data, at + 43)
         if length > (len(data) - at - HEAD.itemsize) // 8:
             (point,) = track(data, at)
             raise BadModel(f"{path}: the file is truncated in point {point}; copy or export it again")
         if i % step == 0:
-            kept.append(at)
-        if len(kept) == block or kept and i == count - 1:
-            _gather(data, kept, heads[: i // step + 1])
-            kept = []
+            starts[i // step] = at
         at += HEAD.itemsize + 8 * length
+    rows, head = np.frombuffer(data, np.uint8), np.arange(HEAD.itemsize)
+    parts = np.array_split(starts, -(-len(starts) // block) or 1)
+    heads = np.concatenate([rows[part[:, None] + head].view(HEAD)[:, 0] for part in parts])
     return _sorted_points(heads["id"], heads["xyz"], heads["rgb"], heads["error"], step)
-
-
-def _gather(data: bytes, starts: list[int], heads: np.ndarray) -> None:
-    """Fill the last of `heads` from the bytes that begin at `starts`."""
-    rows = np.array(starts)[:, None] + np.arange(HEAD.itemsize)
-    heads[len(heads) - len(starts) :] = np.frombuffer(data, np.uint8)[rows].view(HEAD)[:, 0]
 
 
 def text_points(most: int, path: Path, data: bytes) -> ListedPoints:

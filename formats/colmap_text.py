@@ -5,9 +5,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from formats.errors import (
-    BadModel,
-)
+from formats.errors import BadModel
 from formats.safe_input import decoded
 
 LINE_ENDS = re.compile(r"\r\n?|\n")

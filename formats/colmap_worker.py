@@ -1,8 +1,8 @@
 """Structure from motion, in a process of its own: `python -m formats.colmap_worker FOLDER`.
 
 pycolmap's picture codecs collide with Pillow's where both are loaded, its calls cannot be interrupted, and a
-fault in it ends its process. So this module imports nothing but pycolmap and numpy, and `formats.posing`
-starts it, listens to it and ends it.
+fault in it ends its process. So this module imports nothing but pycolmap, numpy and scipy, and
+`formats.posing` starts it, listens to it and ends it.
 
 FOLDER holds `job.json` and the pictures it names. `model/` is left there, COLMAP's binary files of the
 largest model, if there is any. Each line on stdout is a JSON object: the phases with their totals, how much
@@ -14,6 +14,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -167,6 +168,8 @@ def matching_pairs(descriptors: list[np.ndarray]) -> list[tuple[int, int]]:
 
 def _looks(descriptors: list[np.ndarray]) -> np.ndarray:
     """(N, WORDS * 128) float32 of unit length, or 0 for a picture without features."""
+    from scipy.cluster.vq import kmeans2, vq
+
     random = np.random.default_rng(SEED)
     share = max(1, sum(map(len, descriptors)) // SAMPLED)
     sample = np.concatenate([picture_descriptors[::share] for picture_descriptors in descriptors]).astype(
@@ -175,22 +178,16 @@ def _looks(descriptors: list[np.ndarray]) -> np.ndarray:
     if not len(sample):
         return np.zeros((len(descriptors), 1), np.float32)
     words = sample[random.permutation(len(sample))[:WORDS]]
-    for _ in range(10):  # Lloyd's iteration
-        nearest = _nearest(sample, words)
-        words = np.stack(
-            [sample[nearest == i].mean(0) if (nearest == i).any() else word for i, word in enumerate(words)]
-        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of clusters without features, which stay where they were
+        words, _ = kmeans2(sample, words, 10, minit="matrix")
     looks = np.zeros((len(descriptors), len(words), sample.shape[1]), np.float32)
     for look, picture_descriptors in zip(looks, descriptors, strict=True):
         if len(picture_descriptors):
-            nearest = _nearest(picture_descriptors.astype(np.float32), words)
+            nearest, _ = vq(picture_descriptors.astype(np.float32), words)
             np.add.at(look, nearest, picture_descriptors - words[nearest])
     looks = (np.sign(looks) * np.sqrt(np.abs(looks))).reshape(len(descriptors), -1)
     return looks / np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-6)
-
-
-def _nearest(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
-    return np.argmin((words**2).sum(1) - 2 * descriptors @ words.T, axis=1)
 
 
 # --- mapping ------------------------------------------------------------------------------------------------

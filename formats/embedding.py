@@ -8,7 +8,7 @@ import numpy as np
 
 from formats.bundle import BundleWriter, OpenBundle, is_bundle
 from formats.errors import BadSchema
-from formats.graph import placement_of
+from formats.graph import holding, placement_of
 from formats.scene import Node, SceneGraph
 from formats.sources import expand_scene, resolve_source
 
@@ -80,12 +80,7 @@ def in_place_of(node: Node, nodes: tuple[Node, ...], rule: str, own_rule: str) -
             if "crop" not in node.showing:  # it lies in the node's own frame
                 placement = placement_of(node.node_to_parent @ only.node_to_parent)
                 return replace(node, source=None, field=only.field, placement=placement)
-    if node.background:
-        nodes = tuple(replace(one, background=True) for one in nodes)
-    if own_rule != rule and node.children:
-        raise BadSchema(f"node '{node.name}' has children and a source of another composition; part them")
-    node = node if own_rule == rule else replace(node, composition=own_rule)
-    return replace(node, source=None, background=False, children=(*nodes, *node.children))
+    return holding(node, nodes, rule, own_rule)
 
 
 def as_one(scene: SceneGraph, name: str, matrix: np.ndarray, rule: str, background: bool = False) -> Node:

@@ -4,6 +4,9 @@ A sentence names the file, the node or array, what was found, what was expected 
 what the command line ends with.
 """
 
+import contextlib
+from collections.abc import Iterable, Iterator
+
 MAX_SENTENCE = 1000
 
 
@@ -20,6 +23,13 @@ def printable(text: str, limit: int = MAX_SENTENCE) -> str:
 def counted(count: int, one: str, several: str) -> str:
     """A number with the words that go with it: 1 photo is, 2 photos are."""
     return f"{count:,} {one if count == 1 else several}"
+
+
+def listed(names: Iterable[str], most: int = 4) -> str:
+    """ "a, b and 3 more"."""
+    names = list(dict.fromkeys(str(name)[:80] for name in names))
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 class FormatError(Exception):
@@ -68,6 +78,18 @@ class ResourceError(FormatError):
     """The disk is full, the file system is read-only, or permission is missing."""
 
     exit_code = 5
+
+
+@contextlib.contextmanager
+def noted(notes: list[str], rest: str) -> Iterator[None]:
+    """In this block what is wrong with a file becomes a note with the rest of its sentence, since one can do
+    without the file; but for ResourceError."""
+    try:
+        yield
+    except ResourceError:
+        raise
+    except FormatError as error:
+        notes.append(f"{error}; {rest}")
 
 
 # --- bundles ------------------------------------------------------------------------------------------------

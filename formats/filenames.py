@@ -5,8 +5,8 @@ import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
 
-LONGEST_BYTES = 200
-"""Of a name without what is put behind it: file systems end at 255."""
+from formats.names import MAX_NAME_BYTES
+
 DEPTH = "_depth"
 """What the name of a depth picture has behind that of its picture."""
 
@@ -22,7 +22,7 @@ def distinct(names: Sequence[str], endings: Sequence[str] = ("",)) -> list[str]:
     used: set[str] = set()
     unique = []
     for name in names:
-        short = os.fsencode(name)[:LONGEST_BYTES].decode("utf-8", "ignore")
+        short = os.fsencode(name)[:MAX_NAME_BYTES].decode("utf-8", "ignore")
         chosen, count = short, 1
         while used & (spellings := {folded(chosen + ending) for ending in endings}):
             count += 1

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from formats.errors import FormatError
+from formats.errors import BadSchema, FormatError
 from formats.nodes import WHITE, check_name, multiplied
 from formats.scene import Node, SceneGraph
 
@@ -42,18 +42,17 @@ def leaf_names(nodes: Iterable[Node]) -> set[str]:
 def changed(scene: SceneGraph, names: Container[str], becoming: Becoming) -> SceneGraph:
     """The scene after the topmost nodes that go by some names became others; groups that are left empty by
     that go. Raises what a node or a scene that cannot be raises."""
-    return _changed(scene, lambda name: belongs(name, names), becoming)
-
-
-def with_field(scene: SceneGraph, name: str, member: str | None) -> SceneGraph:
-    """The scene whose node of a name has another field; None: without it."""
 
     def after(node: Node, parent: np.ndarray) -> tuple[Node, ...]:
-        if member is None and not node.children:
+        if belongs(node.name, names):
+            return becoming(node, parent)
+        node_to_world = parent @ node.node_to_parent
+        children = tuple(one for child in node.children for one in after(child, node_to_world))
+        if node.children and not children and node.field is None and node.source is None:
             return ()
-        return (replace(node, field=member),)
+        return (node if children == node.children else replace(node, children=children),)
 
-    return _changed(scene, lambda one: one == name, after)
+    return replace(scene, nodes=tuple(one for node in scene.nodes for one in after(node, np.eye(4))))
 
 
 def with_leaves(scene: SceneGraph, becoming: Callable[[Node], Node | None]) -> SceneGraph:
@@ -72,17 +71,15 @@ def with_leaves(scene: SceneGraph, becoming: Callable[[Node], Node | None]) -> S
     return replace(scene, nodes=tuple(one for node in scene.nodes for one in after(node)))
 
 
-def _changed(scene: SceneGraph, goes: Callable[[str], bool], becoming: Becoming) -> SceneGraph:
-    def after(node: Node, parent: np.ndarray) -> tuple[Node, ...]:
-        if goes(node.name):
-            return becoming(node, parent)
-        node_to_world = parent @ node.node_to_parent
-        children = tuple(one for child in node.children for one in after(child, node_to_world))
-        if node.children and not children and node.field is None and node.source is None:
-            return ()
-        return (node if children == node.children else replace(node, children=children),)
+def with_field(scene: SceneGraph, name: str, member: str | None) -> SceneGraph:
+    """The scene whose node of a name holds another field; None: without it."""
 
-    return replace(scene, nodes=tuple(one for node in scene.nodes for one in after(node, np.eye(4))))
+    def after(node: Node) -> Node | None:
+        if node.name != name:
+            return node
+        return None if member is None else replace(node, field=member)
+
+    return with_leaves(scene, after)
 
 
 def without(scene: SceneGraph, names: Container[str]) -> SceneGraph:
@@ -93,6 +90,21 @@ def without(scene: SceneGraph, names: Container[str]) -> SceneGraph:
 def with_nodes(scene: SceneGraph, nodes: Iterable[Node]) -> SceneGraph:
     """The scene with more nodes, behind those it has."""
     return replace(scene, nodes=(*scene.nodes, *nodes))
+
+
+def holding(node: Node, nodes: tuple[Node, ...], rule: str, own_rule: str) -> Node:
+    """A node among others of a rule that holds nodes in place of its source, which are one by a rule of their
+    own. Raises BadSchema where it has children of the other rule."""
+    if own_rule != rule and node.children:
+        raise BadSchema(
+            f"node {node.name!r}: the composition of its source is {own_rule!r}, but that of its children "
+            f"{rule!r}; put them into a group of their own"
+        )
+    if node.background:
+        nodes = tuple(replace(one, background=True) for one in nodes)
+    composition = node.composition if own_rule == rule else own_rule
+    nodes = (*nodes, *node.children)
+    return replace(node, source=None, background=False, children=nodes, composition=composition)
 
 
 def lifted(node: Node, kept: Container[str] = ()) -> Node:

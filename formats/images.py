@@ -12,7 +12,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from formats.errors import BadImage, FormatError, LimitExceeded, MissingExtra, MixedSizes
+from formats.errors import BadImage, FormatError, LimitExceeded, MixedSizes
 from formats.other_files import HEAD, identify
 from formats.png import png_writer
 from formats.safe_input import open_input
@@ -192,7 +192,7 @@ def write_smaller(path: Path | str, smaller: Path, longest: int) -> tuple[int, i
         shrink = min(1.0, longest / max(image.size))
         size = tuple(max(1, round(side * shrink)) for side in image.size)
         image.draft("RGB", size)  # a JPEG is decoded at about this size, which is several times faster
-        picture = _eight_bits(image).convert("RGB").resize(size, Image.Resampling.LANCZOS)
+        picture = eight_bits(image).convert("RGB").resize(size, Image.Resampling.LANCZOS)
     picture.save(smaller, "PNG", compress_level=1)
     return size
 
@@ -217,7 +217,7 @@ def _flipped(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 def _rgba(image, alpha: bool):
     """A decoded picture of any mode as RGBA, opaque where `alpha` is False."""
-    picture = _eight_bits(image).convert("RGBA")  # first, since palettes lose transparency with a warning
+    picture = eight_bits(image).convert("RGBA")  # first, since palettes lose transparency with a warning
     return picture if alpha else picture.convert("RGB").convert("RGBA")
 
 
@@ -228,13 +228,15 @@ def _straight(image):
     return Image.frombytes("RGBa", image.size, image.tobytes()).convert("RGBA")
 
 
-def _eight_bits(image):
-    """A picture of 16 bits of grey with 8, which Pillow would clip; others as they are."""
+def eight_bits(image):
+    """Grey levels of 16 bits and more as 8, which Pillow would clip; other pictures as they are."""
     from PIL import Image
 
-    if not image.mode.startswith("I"):
+    if not image.mode.startswith(("I", "F")):
         return image
-    return Image.fromarray(((np.asarray(image).astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8))
+    scale = 255 / 65535 if image.mode.startswith("I") else 255
+    levels = np.rint(np.asarray(image).astype(np.float64) * scale)
+    return Image.fromarray(np.clip(levels, 0, 255).astype(np.uint8))
 
 
 def _orientation(image) -> int:
@@ -258,7 +260,7 @@ def _decoded(path: Path | str) -> Iterator:
 
 @contextmanager
 def _opened(path: Path | str) -> Iterator:
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     with open_input(path) as file:
         try:
@@ -269,13 +271,13 @@ def _opened(path: Path | str) -> Iterator:
             yield image
         except Image.DecompressionBombError as error:
             raise LimitExceeded(f"{path}: the picture has too many pixels to be decoded safely") from error
-        except DECODING_ERRORS as error:
-            if not _unidentified(error):
-                raise BadImage(
-                    f"{path}: the picture cannot be decoded ({error}); replace or remove it"
-                ) from error
+        except UnidentifiedImageError as error:
             file.seek(0)
             raise _unread(path, file.read(HEAD)) from error
+        except DECODING_ERRORS as error:
+            raise BadImage(
+                f"{path}: the picture cannot be decoded ({error}); replace or remove it"
+            ) from error
 
 
 @cache
@@ -291,10 +293,6 @@ def _readable() -> tuple[str, ...]:
     return tuple(name for name in FORMATS if name in Image.OPEN)
 
 
-def _unidentified(error: Exception) -> bool:
-    return type(error).__name__ == "UnidentifiedImageError"
-
-
 def _unread(path: Path | str, head: bytes) -> FormatError:
     """The error for a file that is no picture of a known format."""
     other = identify(head, Path(path).suffix)
@@ -302,8 +300,7 @@ def _unread(path: Path | str, head: bytes) -> FormatError:
         return BadImage(
             f"{path}: the picture cannot be decoded (damaged, or in no known format); replace or remove it"
         )
-    kind = MissingExtra if other.extra else BadImage
-    return kind(f"{path}: is {other.what}, which is not read as a photo; {other.cure}")
+    return other.error(f"{path}: is {other.what}, which is not read as a photo", BadImage)
 
 
 def _check_header(image, path: Path | str) -> None:

@@ -32,7 +32,13 @@ def output_lock(path: Path | str, waiting: Callable[[str], None] | None = None) 
     beside = hidden_sibling(target, ENDING)
     lock = FileLock(beside, fallback_to_soft=False)
     try:
-        _acquire(lock, waiting, path)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            if waiting is None:
+                raise
+            waiting(f"{path}: waiting for another fusedrf that is writing it")
+            lock.acquire()
     except Timeout as error:
         raise ResourceError(
             f"{path}: another fusedrf is writing it; wait until it has finished, or choose another name"
@@ -58,18 +64,6 @@ def output_lock(path: Path | str, waiting: Callable[[str], None] | None = None) 
         with contextlib.suppress(OSError):
             beside.unlink()
         lock.release()
-
-
-def _acquire(lock, waiting: Callable[[str], None] | None, path: Path | str) -> None:
-    from filelock import Timeout
-
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        if waiting is None:
-            raise
-        waiting(f"{path}: waiting for another fusedrf that is writing it")
-        lock.acquire()
 
 
 @contextlib.contextmanager

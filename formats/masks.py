@@ -1,12 +1,12 @@
 """Masks that lie beside photos: in a folder `masks` or `mask`, or among them under names that say so."""
 
-import os
-import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
-from formats.photos import EXTENSIONS, MOVING, with_mask
+from formats.names import folded
+from formats.photos import EXTENSIONS, MOVING, folders, with_mask
 from formats.views import View
 
 FOLDERS = ("masks", "mask")
@@ -25,22 +25,18 @@ def with_masks_beside(views: Sequence[View], root: Path) -> tuple[tuple[View, ..
     photos = [view for view in views if view.image_path is not None]
     if not photos or any(view.mask_path for view in views):
         return tuple(views), ()
-    shelves: dict[Path, _PictureFolder] = {}
+    pictures_of = cache(_PictureFolder.of)
     around = {view.image_path.parent: _places(view.image_path, root) for view in photos}
     masked_views, used, unused, arrays = [], {}, {}, {}
     for view in views:
         mask = None
-        for folder in around[view.image_path.parent] if view.image_path else ():
-            shelf = shelves.get(folder.folder) or shelves.setdefault(
-                folder.folder, _PictureFolder.of(folder.folder)
-            )
-            mask = shelf.mask_of(
-                view.image_path, folder.inner, is_own_folder=folder.folder == view.image_path.parent
-            )
-            if mask is not None:
+        for folder, inner in around[view.image_path.parent] if view.image_path else ():
+            pictures = pictures_of(folder)
+            is_own = folder == view.image_path.parent
+            if (mask := pictures.mask_of(view.image_path, inner, is_own)) is not None:
                 break
-            if folder.folder != view.image_path.parent:
-                (unused if shelf.files else arrays)[folder.folder] = len(shelf.files) or shelf.arrays
+            if not is_own:
+                (unused if pictures.files else arrays)[folder] = len(pictures.files) or pictures.arrays
         masked_views.append(view if mask is None else with_mask(view, mask))
         if mask is not None:
             used[mask.parent] = used.get(mask.parent, 0) + 1
@@ -60,17 +56,10 @@ def with_masks_beside(views: Sequence[View], root: Path) -> tuple[tuple[View, ..
     return tuple(masked_views), tuple(notes)
 
 
-@dataclass(frozen=True)
-class _MaskFolder:
-    """A folder in which the mask of a photo may be, below `inner` where photos lie in folders too."""
-
-    folder: Path
-    inner: Path
-
-
-def _places(photo: Path, root: Path) -> list[_MaskFolder]:
-    """Where the mask of a photo may be, the likeliest first."""
-    parent, folders = photo.parent, []
+def _places(photo: Path, root: Path) -> list[tuple[Path, Path]]:
+    """Folders in which the mask of a photo may be, the likeliest first, each with the folder in it where the
+    photo lies in one among those of the others."""
+    parent, places = photo.parent, []
     for above in (parent, *parent.parents[:2]):
         inside = above == root or above.is_relative_to(root)
         below = photo.relative_to(above).parts[:-1]
@@ -78,17 +67,16 @@ def _places(photo: Path, root: Path) -> list[_MaskFolder]:
             break
         copy = below[0].rpartition("_")[2] if below else ""
         names = [*(f"{name}_{copy}" for name in FOLDERS if copy.isdecimal()), *FOLDERS]
-        folders += [_MaskFolder(folder, Path(*below[1:])) for folder in _named_so(above, names)]
+        places += [(folder, Path(*below[1:])) for folder in _named_so(above, names)]
         if above == root or not below and not inside:
             break
-    return [*folders, _MaskFolder(parent, Path())]
+    return [*places, (parent, Path())]
 
 
 def _named_so(folder: Path, names: Sequence[str]) -> list[Path]:
     """The folders in a folder that have one of the names, in any case, in the order of the names."""
-    with os.scandir(folder) as entries:
-        unique = [entry.name for entry in entries if entry.name.casefold() in names and entry.is_dir()]
-    return [folder / name for name in sorted(unique, key=lambda name: names.index(name.casefold()))]
+    named = [entry for entry in folders(folder) if entry.name.casefold() in names]
+    return sorted(named, key=lambda entry: names.index(entry.name.casefold()))
 
 
 def _of_photos(name: str) -> bool:
@@ -107,10 +95,10 @@ class _PictureFolder:
     @classmethod
     def of(cls, folder: Path) -> "_PictureFolder":
         """Hidden files are no masks."""
-        nested = [folder] + [entry for entry in sorted(folder.iterdir()) if entry.is_dir()]
+        nested = [folder, *folders(folder)]
         files = [file for at in nested for file in sorted(at.iterdir()) if not file.name.startswith(".")]
         pictures = [file for file in files if file.suffix.lower() in EXTENSIONS]
-        named = {(file.parent.relative_to(folder), _key(file.stem)): file for file in pictures}
+        named = {(file.parent.relative_to(folder), folded(file.stem)): file for file in pictures}
         return cls(named, sum(file.suffix.lower() in (".npy", ".npz") for file in files))
 
     def mask_of(self, photo: Path, inner: Path, is_own_folder: bool) -> Path | None:
@@ -118,10 +106,6 @@ class _PictureFolder:
         names = [] if is_own_folder else [photo.name, photo.stem]
         names += [name.format(base) for name in NAMED for base in (photo.stem, photo.name)]
         folders = (inner, Path()) if inner.parts else (inner,)
-        keys = ((folder, _key(name)) for folder in folders for name in names)
+        keys = ((folder, folded(name)) for folder in folders for name in names)
         candidates = (self.files.get(key) for key in keys)
         return next((file for file in candidates if file is not None and file != photo), None)
-
-
-def _key(name: str) -> str:
-    return unicodedata.normalize("NFC", name).casefold()

@@ -7,14 +7,15 @@ of the capture and below. A path that two photos would suit gets none, nor does 
 """
 
 import os
-import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
-from formats.errors import counted
+from formats.errors import counted, listed
+from formats.names import folded
 from formats.photos import (
     HEIF,
     Folder,
@@ -23,6 +24,7 @@ from formats.photos import (
     is_hidden,
     is_picture,
     natural,
+    smaller_copies,
     split_ending,
 )
 
@@ -116,8 +118,7 @@ def rooted(file: str) -> tuple[str, str]:
 
 def key(name: str) -> str:
     """A name as it is compared: without percent signs, in one form of Unicode and of letters."""
-    plain = unquote(name) if "%" in name else name
-    return (plain if plain.isascii() else unicodedata.normalize("NFC", plain)).casefold().strip()
+    return folded(unquote(name)).strip()
 
 
 def stem_key(name: str) -> str:
@@ -129,30 +130,11 @@ class Listings:
     """The pictures of folders and the smaller copies of folders, each of which is listed once."""
 
     def __init__(self):
-        self._known: dict[Path, dict[str, list[str]]] = {}
-        self._copies: dict[Path, dict[str, list[Folder]]] = {}
+        self.of, self._copies = cache(pictures_by_stem), cache(smaller_copies)
 
     def copies(self, folder: Path) -> list[Folder]:
         """As `formats.photos.copies`."""
-        if folder.parent not in self._copies:
-            named = defaultdict(list)
-            for entry in _entries(folder.parent):
-                plain, _, factor = entry.name.rpartition("_")
-                if factor.isdecimal() and int(factor) > 0 and _is_folder(entry):
-                    named[plain].append(Folder(folder.parent / entry.name, int(factor)))
-            self._copies[folder.parent] = dict(named)
-        beside = self._copies[folder.parent].get(folder.name, [])
-        return [Folder(folder), *sorted(beside, key=lambda copy: copy.factor)]
-
-    def of(self, folder: Path) -> dict[str, list[str]]:
-        """Names of a folder's pictures by `stem_key`; hidden and empty files are none."""
-        if folder not in self._known:
-            named = defaultdict(list)
-            for entry in _entries(folder):
-                if is_picture(entry.name) and _holds_bytes(entry.path):
-                    named[stem_key(entry.name)].append(entry.name)
-            self._known[folder] = dict(named)
-        return self._known[folder]
+        return [Folder(folder), *self._copies(folder.parent).get(folder.name, [])]
 
     def find(self, folder: Path, name: str) -> list[tuple[int, str]]:
         """The pictures of a folder that suit a name, with how well, 0 for the name itself; the best alone, or
@@ -169,6 +151,15 @@ class Listings:
         ]
         best = min(ranks, default=(0, ""))[0]
         return [item for item in ranks if item[0] == best]
+
+
+def pictures_by_stem(folder: Path) -> dict[str, list[str]]:
+    """Names of a folder's pictures by `stem_key`; hidden and empty files are none."""
+    named = defaultdict(list)
+    for entry in _entries(folder):
+        if is_picture(entry.name) and _holds_bytes(entry.path):
+            named[stem_key(entry.name)].append(entry.name)
+    return named
 
 
 def _holds_bytes(path: Path | str) -> bool:
@@ -405,9 +396,8 @@ def gone(missing: Sequence[str]) -> list[str]:
     """A sentence about photos that are left out since they are not there or of 0 bytes."""
     if not missing:
         return []
-    more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
     count = counted(len(missing), "photo is not there or empty", "photos are not there or empty")
-    return [f"{count} and left out: {', '.join(missing[:NAMED])}{more}"]
+    return [f"{count} and left out: {listed(missing, NAMED)}"]
 
 
 def _differs(file: str, photo: Path) -> bool:

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from formats.capture_frame import BORDER, box_around, sphere
 from formats.errors import BadMesh, FormatError
 from formats.other_files import not_a_mesh
-from formats.points import MAX_HEADER
+from formats.ply_elements import MAX_HEADER
 from formats.safe_input import open_input
 from formats.surfaces.gltf import read_gltf
 from formats.surfaces.obj import read_obj
@@ -23,17 +24,8 @@ from formats.surfaces.off import read_off
 from formats.surfaces.ply import read_ply
 from formats.surfaces.stl import read_stl
 from formats.surfaces.surface import Notes, Surface
-from formats.surfaces.tracing import GOLDEN_ANGLE, Mesh, embree_scene, render_mesh, seen_from_behind
+from formats.surfaces.tracing import Mesh, embree_scene, render_mesh, seen_from_behind
 from formats.views import Capture, View
-
-__all__ = [
-    "is_mesh",
-    "mesh_capture",
-    "mesh_facts",
-    "mesh_surfaces",
-    "mesh_type",
-    "render_mesh",
-]
 
 READERS = {
     "glb": read_gltf,
@@ -45,8 +37,6 @@ READERS = {
 }
 GLTF = ("glb", "gltf")
 FIELD_OF_VIEW = math.radians(40)
-MARGIN = 0.02
-"""Of the mesh's size, added to its box on every side and to the sphere that the cameras frame."""
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """glTF's world, in which +y is up, to one in which +z is."""
 UPRIGHT_NOTE = "glTF has +y up: the mesh was turned about x so that +z is up"
@@ -109,7 +99,13 @@ def mesh_capture(
         pixels = list(threads.map(lambda view: render_mesh(mesh, view, samples_per_pixel), train + test))
     seen = tuple(replace(view, pixels=picture) for view, picture in zip(train + test, pixels, strict=True))
     return Capture(
-        Path(path), "mesh", seen[:n_train], seen[n_train:], _box(mesh), opaque=False, notes=mesh.notes
+        Path(path),
+        "mesh",
+        seen[:n_train],
+        seen[n_train:],
+        box_around(mesh.vertices),
+        opaque=False,
+        notes=mesh.notes,
     )
 
 
@@ -128,7 +124,7 @@ def mesh_facts(path: Path | str) -> dict:
         "textures": [f"{width}x{height}" for height, width, _ in pictures.values()],
         "vertex_colours": any(s.colours is not None or s.face_colours is not None for s in mesh.surfaces),
         "see_through": not mesh.opaque,
-        "aabb": _box(mesh).tolist(),
+        "aabb": box_around(mesh.vertices).tolist(),
         "notes": list(mesh.notes),
     }
 
@@ -184,25 +180,15 @@ def _load(path: Path | str) -> Mesh:
     return replace(mesh, notes=(*notes, f"{path}: {FROM_BEHIND}")) if seen_from_behind(mesh) else mesh
 
 
-def _box(mesh: Mesh) -> np.ndarray:
-    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-    margin = MARGIN * (high - low).max()
-    return np.concatenate([low - margin, high + margin])
-
-
 # --- cameras ------------------------------------------------------------------------------------------------
 
 
 def _around(mesh: Mesh, n: int, size: int, prefix: str, random: np.random.Generator) -> list[View]:
     """`n` cameras spread evenly over a sphere, turned at random, whose views just frame the mesh's sphere."""
-    distance = (1 + MARGIN) * mesh.radius / math.sin(FIELD_OF_VIEW / 2)
+    distance = (1 + BORDER) * mesh.radius / math.sin(FIELD_OF_VIEW / 2)
     focal = 0.5 * size / math.tan(FIELD_OF_VIEW / 2)
     turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
-    step = np.arange(n)
-    z, angle = 1 - (2 * step + 1) / max(n, 1), GOLDEN_ANGLE * step
-    ring = np.sqrt(1 - z * z)
-    outward = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], 1) @ turn.T
-    poses = [_look_at(mesh.centre + distance * direction, mesh.centre) for direction in outward]
+    poses = [_look_at(mesh.centre + distance * out, mesh.centre) for out in sphere(n) @ turn.T]
     middle = size / 2
     return [
         View(f"{prefix}_{i:03d}", p, focal, focal, middle, middle, size, size) for i, p in enumerate(poses)

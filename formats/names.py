@@ -1,15 +1,21 @@
 """Names of cameras, under which their pictures are written: they come from files of anyone's making."""
 
+import unicodedata
 from collections.abc import Iterable
 
 MAX_NAME_BYTES = 200
-"""A picture is written under the name of its camera, with an ending."""
+"""A picture is written under the name of its camera, with an ending: file systems end at 255."""
 SHORT = 40
 
 
 def is_name(name: str) -> bool:
     """Whether a picture can be written under it everywhere."""
     return name.isprintable() and not set(name) & set("/\\") and 0 < len(name.encode()) <= MAX_NAME_BYTES
+
+
+def folded(name: str) -> str:
+    """Equal for names that differ in the case of letters, or in how accents are put together."""
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def distinct_names(names: Iterable[str]) -> list[str]:

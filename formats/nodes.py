@@ -182,9 +182,12 @@ def _placement_matrix(placement: dict, name: str) -> np.ndarray:
         if len(placement) > 1:
             raise BadSchema(f"node {name!r}: has a matrix and {sorted(placement)[-1]}, expected one of them")
         return _numbers(placement["matrix"], (4, 4), name, "matrix")
-    turn = _unit(_numbers(placement.get("rotation", [0, 0, 0, 1]), (4,), name, "rotation"), name)
+    turn = _numbers(placement.get("rotation", [0, 0, 0, 1]), (4,), name, "rotation")
+    norm = math.hypot(*turn)
+    if abs(norm - 1) > QUATERNION_SLACK:
+        raise BadSchema(f"node {name!r}: rotation has length {norm:.6g}, expected a unit quaternion xyzw")
     matrix = np.eye(4)
-    matrix[:3, :3] = matrices(turn) * _numbers(placement.get("scale", [1, 1, 1]), (3,), name, "scale")
+    matrix[:3, :3] = matrices(turn / norm) * _numbers(placement.get("scale", [1, 1, 1]), (3,), name, "scale")
     matrix[:3, 3] = _numbers(placement.get("translation", [0, 0, 0]), (3,), name, "translation")
     return matrix
 
@@ -199,13 +202,6 @@ def _numbers(values, shape: tuple[int, ...], name: str, word: str) -> np.ndarray
     if not np.isfinite(array).all():
         raise NotFinite(f"node {name!r}: {word} holds NaN or infinity, expected finite numbers")
     return array
-
-
-def _unit(quaternion: np.ndarray, name: str) -> np.ndarray:
-    norm = math.hypot(*quaternion)
-    if abs(norm - 1) > QUATERNION_SLACK:
-        raise BadSchema(f"node {name!r}: rotation has length {norm:.6g}, expected a unit quaternion xyzw")
-    return quaternion / norm
 
 
 def check_affine(matrix: np.ndarray, who: str) -> None:

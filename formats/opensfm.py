@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.cameras import MAX_JSON, checked_focal, checked_size
+from formats.cameras import BENDS, FISHEYE_BENDS, MAX_JSON, checked_focal, checked_size, stated_number
 from formats.colmap import Image, Model
-from formats.errors import BadIntrinsics, BadJson, BadModel, BadPose, FormatError, UnsupportedCamera
+from formats.errors import BadJson, BadModel, BadPose, FormatError, UnsupportedCamera
 from formats.frame_list import read_sound
 from formats.photos import is_file
 from formats.points import MAX_POINTS, SparsePoints
@@ -25,7 +25,6 @@ NAME, PROJECT = "reconstruction.json", "opensfm"
 """The file, and the folder that OpenDroneMap keeps it in beside its photos."""
 PINHOLES = ("perspective", "simple_radial", "radial", "brown")
 FISHEYES = ("fisheye", "fisheye_opencv")
-BENDS = ("k1", "k2", "k3", "p1", "p2")
 HEAD = 1 << 16
 
 
@@ -93,24 +92,16 @@ def _view(where: str, camera: dict, shot: dict) -> View:
             f"{where}: a camera of the type {kind[:40]}, expected a pinhole or a fisheye; undistort them"
         )
     keys = ("width", "height", "focal", "focal_x", "focal_y", "c_x", "c_y", *BENDS, "k4")
-    numbers = {key: _number(where, camera, key) for key in keys}
+    numbers = {key: stated_number((camera,), key, where, 0.0) for key in keys}
     width, height = checked_size(round(numbers["width"]), round(numbers["height"]), where)
     longer = max(width, height)
     focals = [
         checked_focal(longer * (numbers[key] or numbers["focal"]), where) for key in ("focal_x", "focal_y")
     ]
     centre = width / 2 + longer * numbers["c_x"], height / 2 + longer * numbers["c_y"]
-    bends = ("k1", "k2", "k3", "k4") if kind in FISHEYES else BENDS
+    bends = FISHEYE_BENDS if kind in FISHEYES else BENDS
     bends = tuple(numbers[key] for key in bends)
     return View("", pose, *focals, *centre, width, height, bends, kind in FISHEYES, repair=repair)
-
-
-def _number(where: str, camera: dict, key: str) -> float:
-    """A number of a camera, 0 where it states none."""
-    number = _numbers([camera.get(key, 0.0)], 1)
-    if number is None:
-        raise BadIntrinsics(f"{where}: the {key} of its camera is no number; reconstruct again")
-    return float(number[0])
 
 
 def _numbers(listed: object, count: int) -> np.ndarray | None:

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from formats.errors import BadMesh, FormatError, MissingExtra, NotACapture
+from formats.errors import BadMesh, FormatError, MissingExtra, NotACapture, counted
 from formats.safe_input import open_input
 
 HEAD = 1 << 14
@@ -46,6 +46,10 @@ class OtherFile(NamedTuple):
     cure: str
     extra: bool = False
     """Whether an extra that is not installed reads it."""
+
+    def error(self, sentence: str, kind: type[FormatError] = NotACapture) -> FormatError:
+        """The error of that kind, or of the extra that is missing."""
+        return (MissingExtra if self.extra else kind)(f"{sentence}; {self.cure}")
 
 
 KINDS = {  # the first whose pattern fits counts
@@ -199,8 +203,7 @@ def not_a_capture(path: Path) -> FormatError:
     if path.is_dir():
         return _of_folder(path)
     other = _named(path)
-    kind = MissingExtra if other.extra else NotACapture
-    return kind(f"{path}: is {other.what}, no capture; {other.cure}")
+    return other.error(f"{path}: is {other.what}, no capture")
 
 
 def not_a_mesh(path: Path) -> BadMesh:
@@ -277,8 +280,7 @@ def _of_folder(path: Path) -> FormatError:
         return NotACapture(f"{path}: the folder is empty; give the folder that the photos lie in")
     photos = [file for file in files if BY_ENDING.get(file.suffix.lower()) in ("photo", "heif")]
     if any((path / name).is_file() for name in ("metadata", "metadata.json")) and (path / "rgbd").is_dir():
-        what, cure = KINDS["record3d"][:2]
-        return NotACapture(f"{path}: is {what}, no capture; {cure}")
+        return _foreign("record3d").error(f"{path}: is {KINDS['record3d'].what}, no capture")
     if nested := sorted({file.parent for file in photos} - {path}):
         counts = [sum(file.parent == folder for file in photos) for folder in nested]
         most = nested[counts.index(max(counts))]
@@ -286,19 +288,16 @@ def _of_folder(path: Path) -> FormatError:
         more = f"; {unused[0].name}, {other_cameras(unused[0]).what}, is not used" if unused else ""
         cure = "give that folder" if len(nested) == 1 else "give that folder, or put all photos into one"
         return NotACapture(
-            f"{path}: its photos lie in {_counted(len(nested), 'folder')} below it, {max(counts)} of them in "
-            f"{most.relative_to(path)}; {cure}{more}"
+            f"{path}: its photos lie in {counted(len(nested), 'folder', 'folders')} below it, "
+            f"{max(counts)} of them in {most.relative_to(path)}; {cure}{more}"
         )
     if (beside := beside_photos(path)) is None:
         return NotACapture(
-            f"{path}: holds {_counted(len(files), 'file')} such as {files[0].name}, but no photos and no "
-            "poses; give the folder that the photos lie in"
+            f"{path}: holds {counted(len(files), 'file', 'files')} such as {files[0].name}, but no "
+            "photos and no poses; give the folder that the photos lie in"
         )
     name, other = beside
-    kind = MissingExtra if other.extra else NotACapture
-    return kind(
-        f"{path}: holds no photos that can be read and no poses, but {name}, {other.what}; {other.cure}"
-    )
+    return other.error(f"{path}: holds no photos that can be read and no poses, but {name}, {other.what}")
 
 
 def beside_photos(folder: Path) -> tuple[str, OtherFile] | None:
@@ -308,10 +307,6 @@ def beside_photos(folder: Path) -> tuple[str, OtherFile] | None:
         if other is not None and other.kind not in ("text", "photo", "empty"):
             return file.name, other
     return None
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def _entries(path: Path, depth: int = 2) -> Iterator[Path]:

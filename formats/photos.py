@@ -7,6 +7,7 @@ a whole factor: each pixel is the mean of so many a side.
 """
 
 import re
+from collections import defaultdict
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -130,22 +131,15 @@ def folders(path: Path) -> list[Path]:
     """The visible folders in a folder, in natural order; none where it cannot be read."""
     try:
         entries = [entry for entry in path.iterdir() if not is_hidden(entry.name) and entry.is_dir()]
-    except OSError:
+    except (OSError, ValueError):
         return []
     return sorted(entries, key=lambda entry: natural(entry.name))
 
 
-def find_photo(folder: Path, name: str) -> Path | None:
-    """The photo `name` of a folder, with the extension it has on disk; None where there is none."""
-    exact = folder / name
-    if not (name and exact.name):
-        return None
-    if is_file(exact):
-        return exact
-    stem = split_ending(exact.name)[0]
-    endings = (form(ending) for ending in EXTENSIONS for form in (str.lower, str.upper))
-    candidates = (exact.with_name(stem + ending) for ending in endings)
-    return next((candidate for candidate in candidates if is_file(candidate)), None)
+def visible_files(folder: Path, ending: str) -> list[Path]:
+    """The visible files in a folder whose names end so, in natural order."""
+    entries = [file for file in folder.glob(f"*{ending}") if not is_hidden(file.name)]
+    return sorted(entries, key=lambda entry: natural(entry.name))
 
 
 def is_file(path: Path) -> bool:
@@ -158,17 +152,17 @@ def is_file(path: Path) -> bool:
 
 def copies(folder: Path) -> list[Folder]:
     """`folder`, and the folders of smaller copies beside it, `folder_2` before `folder_8`."""
-    try:
-        folders = [copy for copy in folder.parent.glob(f"{_escaped(folder.name)}_*") if copy.is_dir()]
-    except (OSError, ValueError):
-        folders = []
-    numbered = [(copy.name[len(folder.name) + 1 :], copy) for copy in folders]
-    factors = sorted((int(n), copy) for n, copy in numbered if n.isdecimal() and int(n) > 0)
-    return [Folder(folder), *(Folder(copy, factor) for factor, copy in factors)]
+    return [Folder(folder), *smaller_copies(folder.parent).get(folder.name, [])]
 
 
-def _escaped(name: str) -> str:
-    return re.sub(r"([*?\[])", r"[\1]", name)
+def smaller_copies(parent: Path) -> dict[str, list[Folder]]:
+    """Folders in a folder that are called `name_2` and so on, by that name, in the order of their factors."""
+    named = defaultdict(list)
+    for folder in folders(parent):
+        plain, _, factor = folder.name.rpartition("_")
+        if factor.isdecimal() and int(factor) > 0:
+            named[plain].append(Folder(folder, int(factor)))
+    return named
 
 
 def chosen_copy(folders: list[tuple[Folder, Path]], downscale: int | None) -> Folder | None:
@@ -329,7 +323,7 @@ def load_photos(views: Sequence[View], masks: str = "ignore") -> Photos:
 
     def load(view: View, span: tuple[int, int]) -> None:
         part = slice(*span)
-        _decode(view, pixels[part].reshape(view.height, view.width, 4))
+        decoded(view, pixels[part].reshape(view.height, view.width, 4))
         if view.mask_path:
             ignored[part] = load_ignored(view).ravel()
 
@@ -405,13 +399,9 @@ def _named(view: View) -> Path | str:
     return view.image_path or view.name
 
 
-def decoded(view: View) -> np.ndarray:
-    """(H, W, 4) uint8 of one view's photo. Raises as `load_photos`."""
-    return _decode(view, np.empty((view.height, view.width, 4), np.uint8))
-
-
-def _decode(view: View, out: np.ndarray) -> np.ndarray:
-    """The same into an array."""
+def decoded(view: View, out: np.ndarray | None = None) -> np.ndarray:
+    """(H, W, 4) uint8 of one view's photo, in `out` where that is given. Raises as `load_photos`."""
+    out = np.empty((view.height, view.width, 4), np.uint8) if out is None else out
     if view.pixels is not None:
         out[:] = oriented(view.pixels, view.orientation)
         return out

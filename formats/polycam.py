@@ -5,9 +5,9 @@ Its world has y up; rows are cycled so that z is up, as nerfstudio does.
 
 from pathlib import Path
 
-from formats.cameras import MOST_PIXELS, checked_focal, checked_size, read_document
+from formats.cameras import checked_focal, checked_size, read_document, stated_number
 from formats.errors import BadIntrinsics, BadPose
-from formats.photos import is_hidden, natural
+from formats.photos import visible_files
 from formats.views import View, checked_pose
 
 FOLDERS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
@@ -19,15 +19,9 @@ def keyframes(path: Path) -> tuple[Path, Path] | None:
     """The folders of photos and of cameras of an export, or of its `keyframes`; None if it is none."""
     for folder in (path / "keyframes", path):
         for photos, cameras in FOLDERS:
-            if (folder / photos).is_dir() and camera_files(folder / cameras):
+            if (folder / photos).is_dir() and visible_files(folder / cameras, ".json"):
                 return folder / photos, folder / cameras
     return None
-
-
-def camera_files(folder: Path) -> list[Path]:
-    """The cameras of a folder in the natural order of their photos."""
-    files = [file for file in folder.glob("*.json") if not is_hidden(file.name)]
-    return sorted(files, key=lambda file: natural(file.name))
 
 
 def read_camera(path: Path, size: tuple[int, int]) -> View:
@@ -41,15 +35,10 @@ def read_camera(path: Path, size: tuple[int, int]) -> View:
         raise BadPose(f"{path}: expected its pose as twelve numbers t_00 to t_23; export it again")
     if document.get("width") is None or document.get("height") is None:
         document |= dict(zip(("width", "height"), size, strict=True))
-    numbers = {}
-    for key in ("fx", "fy", "cx", "cy", "width", "height"):
-        numbers[key] = document.get(key)
-        if isinstance(numbers[key], bool) or not isinstance(numbers[key], int | float):
-            raise BadIntrinsics(f"{path}: expected {key} to be a number; export it again")
-        if not abs(numbers[key]) <= MOST_PIXELS:
-            raise BadIntrinsics(
-                f"{path}: {key} is {str(numbers[key])[:40]}, expected a number up to {MOST_PIXELS:g}"
-            )
+    keys = ("fx", "fy", "cx", "cy", "width", "height")
+    numbers = {key: stated_number((document,), key, str(path), None) for key in keys}
+    if None in numbers.values():
+        raise BadIntrinsics(f"{path}: expected {', '.join(keys)} to be numbers; export it again")
     inner = [float(numbers[key]) for key in ("fx", "fy", "cx", "cy")]
     for focal in inner[:2]:
         checked_focal(focal, str(path))

@@ -17,7 +17,7 @@ import numpy as np
 
 from formats.cameras import MOST_PIXELS, checked_focal
 from formats.errors import BadIntrinsics, BadModel, BadPose, MissingFile
-from formats.photos import is_file, is_hidden, natural
+from formats.photos import is_file, visible_files
 from formats.safe_input import decoded, read_input
 from formats.views import View, checked_pose
 
@@ -60,23 +60,14 @@ class PoseFiles:
 
 def pose_files(path: Path) -> PoseFiles | None:
     """Those of a capture's folder; None where none lie there."""
-    beside = {
-        f"{file.name.removesuffix(SCENES)}.color.png": file
-        for file in _texts(path)
-        if file.name.endswith(SCENES)
-    }
+    beside = {f"{file.name.removesuffix(SCENES)}.color.png": file for file in visible_files(path, SCENES)}
     if beside:
         return PoseFiles(path, beside, _first(path, INTRINSICS) or _first(path.parent, INTRINSICS), None)
     for photos, poses in ((photos, poses) for photos in PHOTOS for poses in POSES):
-        if (path / photos).is_dir() and (texts := _texts(path / poses)):
+        if (path / photos).is_dir() and (texts := visible_files(path / poses, ".txt")):
             named = {file.stem: file for file in texts}
             return PoseFiles(path / photos, named, _first(path, INTRINSICS), _first(path, ("bbox.txt",)))
     return None
-
-
-def _texts(folder: Path) -> list[Path]:
-    files = [file for file in folder.glob("*.txt") if not is_hidden(file.name)]
-    return sorted(files, key=lambda file: natural(file.name))
 
 
 def _first(folder: Path, names: Sequence[str]) -> Path | None:

@@ -1,6 +1,5 @@
 """One radiance field as a plain record, and its bytes: a safetensors file with one metadata key."""
 
-import hashlib
 import json
 import math
 import re
@@ -9,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import safetensors.numpy
 
-from formats.archive import give_back, pieces
+from formats.archive import give_back, sha256_of_bytes
 from formats.errors import (
     BadArray,
     BadHeader,
@@ -78,6 +77,11 @@ class CodedSpec:
     runs: bool
     """Whether its rows lie in runs, of the lengths in NAME.runs."""
 
+    @property
+    def entry(self) -> dict:
+        """What the field's header says of it."""
+        return {"bits": self.bits, "shape": list(self.shape)} | ({"runs": True} if self.runs else {})
+
 
 @dataclass(frozen=True)
 class FieldHeader:
@@ -106,9 +110,7 @@ class FieldHeader:
 
     @property
     def precision(self) -> str:
-        """The one of PRECISIONS that it was written with, as its arrays show: the most exact one where
-        another program mixed several.
-        """
+        """The one of PRECISIONS that it was written with, as its arrays show; of several the most exact."""
         if any(self.specs[name].dtype == DTYPES["F32"] for name in self.plain):
             return "float32"
         bits = max((spec.bits for spec in self.coded.values()), default=None)
@@ -153,14 +155,6 @@ def encode_stored(kind: str, metadata: dict, stored: dict[str, np.ndarray], code
 def member_name(data: bytes | memoryview) -> str:
     """The name that a field's bytes give it in a bundle."""
     return f"fields/{sha256_of_bytes(data)[:16]}.safetensors"
-
-
-def sha256_of_bytes(data: bytes | memoryview) -> str:
-    """Hex SHA-256, a piece after the other."""
-    digest = hashlib.sha256()
-    for piece in pieces(data):
-        digest.update(piece)
-    return digest.hexdigest()
 
 
 def coded_bytes(shape: tuple[int, ...], precision: str) -> int:
@@ -280,8 +274,7 @@ def _stored_arrays(
             _cast(name, array, precision, where)  # a scale is a float16 too
             runs = arrays.get(runs_of(name))
             parts = dict(zip(coded_parts(name), quantised(array, BITS[precision], runs), strict=True))
-            coded[name] = {"bits": BITS[precision], "shape": list(shape)}
-            coded[name] |= {} if runs is None else {"runs": True}
+            coded[name] = CodedSpec(BITS[precision], shape, runs is not None).entry
         else:
             parts = {name: _stored(name, array, precision, where)}
         if twice := parts.keys() & stored.keys():

@@ -10,6 +10,7 @@ from typing import BinaryIO
 
 from formats.errors import BadJson, LimitExceeded, MissingFile, NotAFile, ResourceError
 
+MAX_BYTES = 2**31  # of a file that is read at once
 MAX_INTEGER = 2**63 - 1
 # Commas and opening brackets of a document, and its colons: what bounds the time and memory of parsing it.
 MAX_VALUES = 500_000
@@ -43,7 +44,7 @@ def _unopened(path: Path | str, error: Exception) -> Exception:
     return ResourceError(f"{path}: cannot be read ({error.strerror})")
 
 
-def read_input(path: Path | str, limit: int) -> bytes:
+def read_input(path: Path | str, limit: int = MAX_BYTES) -> bytes:
     """All bytes of a regular file; LimitExceeded, from its size alone, where it holds more than `limit`."""
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size

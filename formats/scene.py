@@ -40,9 +40,7 @@ from formats.nodes import (
     multiplied,
     within,
 )
-from formats.nodes import (
-    make_node as make_node,
-)
+from formats.nodes import make_node as make_node
 from formats.safe_input import parse_json, read_input
 
 FORMAT = "rfpack"
@@ -109,9 +107,7 @@ class SceneSchema(msgspec.Struct, omit_defaults=True):
 
 NODE_KEYS = NodeSchema.__struct_fields__
 SHOWING_KEYS = ("visible", "crop", "opacity", "tint")
-SCENE_KEYS = (
-    "format", "version", "requires", "generator", "composition", "nodes", "history", "framing", "cameras",
-)  # fmt: skip
+SCENE_KEYS = SceneSchema.__struct_fields__
 
 
 @dataclass(frozen=True)
@@ -217,7 +213,9 @@ def parse_scene(data: bytes, where: str) -> SceneGraph:
     try:
         spec = msgspec.convert(known, SceneSchema)
         roots = tuple(_build_node(node) for node in nodes)
-        shown = _framing(content), _cameras(content)
+        if "cameras" in content:
+            read_camera_set(content["cameras"])
+        shown = _framing(content), content.get("cameras")
         history = tuple(spec.history)
         return SceneGraph(roots, spec.composition, history, spec.generator, spec.version, extras, *shown)
     except msgspec.ValidationError as error:
@@ -280,15 +278,6 @@ def is_scene(path: Path | str) -> bool:
     return isinstance(content, dict) and content.get("format") == FORMAT
 
 
-def scene_schema() -> dict:
-    """JSON Schema (draft 2020-12) of scene.json, the one in `formats/scene.schema.json`."""
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "rfpack scene graph",
-        **msgspec.json.schema(SceneSchema),
-    }
-
-
 def _check_version(content: object, where: str) -> bool:
     """Whether a minor version newer than ours wrote `content`."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -329,13 +318,6 @@ def _framing(content: dict) -> tuple[float, ...] | None:
     return tuple(float(number) for number in box)
 
 
-def _cameras(content: dict) -> dict | None:
-    """The cameras as they stand in the file, once they are known to be readable."""
-    if "cameras" in content:
-        read_camera_set(content["cameras"])
-    return content.get("cameras")
-
-
 def _check_extent(nodes: object, where: str) -> None:
     """Count and depth on the raw JSON, before anything recurses into it."""
     level, count, depth = nodes if isinstance(nodes, list) else [], 0, 0
@@ -348,15 +330,13 @@ def _check_extent(nodes: object, where: str) -> None:
 
 
 def _known(nodes: object) -> object:
-    """`nodes` without the keys that a newer minor version may have added."""
-    if not isinstance(nodes, list):
+    """Nodes without the keys that a newer minor version may have added."""
+    if isinstance(nodes, list):
+        return [_known(node) for node in nodes]
+    if not isinstance(nodes, dict):
         return nodes
-    return [_known_node(node) if isinstance(node, dict) else node for node in nodes]
-
-
-def _known_node(node: dict) -> dict:
-    known = {key: value for key, value in node.items() if key in NODE_KEYS}
-    return known | {"children": _known(node["children"])} if "children" in node else known
+    known = {key: value for key, value in nodes.items() if key in NODE_KEYS}
+    return known | {"children": _known(known["children"])} if "children" in known else known
 
 
 def _build_node(content: dict) -> Node:

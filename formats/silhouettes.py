@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from formats.capture_frame import nearest_point
+from formats.capture_frame import evenly, nearest_point
 from formats.images import oriented, read_alpha, read_image
 from formats.photos import OPAQUE, decoded, decoders, load_ignored
 from formats.views import View
@@ -74,10 +74,8 @@ class Outline:
     """Left, top, right, bottom around it, in pixels of the view; None where nothing of it is shown."""
     filled: float
     """Share of that box."""
-    share: float
-    """Of the photo's pixels."""
     border: float
-    """Of the pixels along its borders."""
+    """Share of the pixels along the photo's borders."""
     middle: float
     """Opaque ones, of the pixels of its middle, half as wide and high."""
     soft: float = 0.0
@@ -102,7 +100,7 @@ class Outline:
             left, top, right, bottom = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
             box = tuple(float(side) * scale for side in (left, top, right, bottom))
             filled = float(mask[top:bottom, left:right].mean())
-        return cls(box, filled, *(float(part.mean()) for part in (mask, border, middle)), **shares)
+        return cls(box, filled, *(float(part.mean()) for part in (border, middle)), **shares)
 
 
 def alpha_outline(view: View) -> Outline:
@@ -114,16 +112,6 @@ def alpha_outline(view: View) -> Outline:
     if levels[most] == 1 or most >= FAINT and levels[most] > 1 - TRANSPARENT:  # the same all over
         clear = soft = 0.0
     return Outline.of(alpha >= FAINT, 1 / view.reduction, alpha >= OPAQUE, clear=clear, soft=soft)
-
-
-def mask_outline(view: View) -> Outline:
-    """What the mask of a view keeps."""
-    return Outline.of(~load_ignored(view), 1.0)
-
-
-def ground_outline(view: View) -> Outline:
-    """What is not white of a view's photo."""
-    return Outline.of((decoded(view)[..., :3] < 255 - GROUND).any(2), 1.0)
 
 
 def shown_pixels(view: View) -> np.ndarray:
@@ -147,12 +135,12 @@ def sampled(views: Sequence[View]) -> list[View]:
     """As many views, evenly spaced in the list, as are quickly decoded."""
     each = np.mean([view.width * view.height * view.reduction**2 for view in views])
     count = min(len(views), max(LEAST_LOOKED_AT, int(LOOKED_AT / each)))
-    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, count).astype(int))]
+    return [views[i] for i in evenly(len(views), count)]
 
 
 def few(views: Sequence[View]) -> list[View]:
     """SAMPLED of the views, evenly spaced in the list."""
-    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, SAMPLED).astype(int))]
+    return [views[i] for i in evenly(len(views), SAMPLED)]
 
 
 # --- alpha --------------------------------------------------------------------------------------------------
@@ -288,7 +276,9 @@ def by_ground(views: tuple[View, ...]) -> Shown:
     if not white:
         return Shown(views, notes=(surroundings,))
     looked_at = sampled(views)
-    all_outlines = outlines(looked_at, ground_outline)
+    all_outlines = outlines(
+        looked_at, lambda view: Outline.of((decoded(view)[..., :3] < 255 - GROUND).any(2), 1.0)
+    )
     free = float(np.mean([outline.border <= STRAY for outline in all_outlines]))
     boxed = [outline for outline in all_outlines if outline.box]
     if free < MOSTLY or not boxed or len(boxed) >= LEAST_WHOLE and _filled(boxed):
@@ -319,7 +309,7 @@ def by_masks(views: tuple[View, ...]) -> Shown:
     if 2 * len(masked) < len(views):
         note = f"{bare} of {len(views)} photos have no mask and are used as they are"
         return Shown(views, notes=(note,) if masked else ())
-    all_outlines = outlines(masked, mask_outline)
+    all_outlines = outlines(masked, lambda view: Outline.of(~load_ignored(view), 1.0))
     seen = [outline for outline in all_outlines if outline.box]
     notes = []
     if len(seen) < len(all_outlines):

@@ -9,13 +9,13 @@ from pathlib import Path
 
 from formats.errors import (
     BadName,
-    BadSchema,
     CyclicScene,
     FormatError,
     LimitExceeded,
     MissingFile,
     OutsideFolder,
 )
+from formats.graph import holding
 from formats.nodes import Node
 from formats.scene import MAX_DEPTH, MAX_NODES, SceneGraph, is_scene, read_scene
 
@@ -35,7 +35,8 @@ def resolve_source(scene_path: Path | str, source: str, allow_outside: bool = Fa
     path = folder / source
     inside = Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
     if not allow_outside and (".." in parts or parts[0] == "" or drive or not inside):
-        raise _outside(scene_path, source)
+        what = f"{scene_path}: source {source!r} leads out of the scene's folder"
+        raise OutsideFolder(f"{what}; move the file in, or give --allow-outside")
     if not os.path.exists(path):
         raise MissingFile(f"{scene_path}: source {source!r} does not exist (looked for at {path})")
     return path
@@ -95,14 +96,7 @@ class _Expansion:
             loop = " -> ".join(Path(step).name for step in (*trail[trail.index(real) :], real))
             raise CyclicScene(f"{target}: leads back to itself ({loop}); remove one of these sources")
         nested = self.nodes(inner.nodes, target, node.name + "/", (*trail, real), inner.composition)
-        if node.background:
-            nested = tuple(replace(child, background=True) for child in nested)
-        if inner.composition != rule:
-            if children:
-                rules = f"{inner.composition!r}, but that of the nodes beside it {rule!r}"
-                raise BadSchema(f"{target}: its composition is {rules}; put them into a group of their own")
-            node = replace(node, composition=inner.composition)
-        return replace(node, source=None, background=False, children=(*nested, *node.children))
+        return holding(node, nested, rule, inner.composition)
 
     def find(self, path: Path, source: str) -> tuple[Path, str, SceneGraph | None]:
         """The source's path as written, its real path, and its scene (None if it is none), looked up once."""
@@ -114,8 +108,3 @@ class _Expansion:
 
     def relative(self, target: Path) -> str:
         return Path(os.path.relpath(target, self.folder)).as_posix()
-
-
-def _outside(scene_path: Path | str, source: str) -> OutsideFolder:
-    what = f"{scene_path}: source {source!r} leads out of the scene's folder"
-    return OutsideFolder(f"{what}; move the file in, or give --allow-outside")

@@ -1,7 +1,6 @@
 """Captures whose cameras stand in `transforms*.json`: Blender's, instant-ngp's and nerfstudio's."""
 
 import json
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +11,6 @@ import numpy as np
 from formats import colmap
 from formats.cameras import (
     frame_file,
-    frame_names,
     frame_view,
     frame_where,
     read_document,
@@ -20,11 +18,11 @@ from formats.cameras import (
     written_path,
 )
 from formats.capture_frame import depth_range
-from formats.errors import BadSchema, FormatError, MissingFile, NoViews, ResourceError, counted
-from formats.frame_list import once, read_sound, repair_notes
-from formats.images import Header, read_image_header
-from formats.matching import MatchedPhotos, find_file, match_photos, stem_key
-from formats.photos import natural, on_photo
+from formats.errors import BadSchema, MissingFile, NoViews, counted, noted
+from formats.frame_list import SplitPart, read_listed
+from formats.images import Header
+from formats.matching import find_file, stem_key
+from formats.photos import Folder, natural
 from formats.points import MAX_POINTS, SparsePoints, points_notes, read_ply_points
 from formats.views import View
 
@@ -36,27 +34,14 @@ AGREEING = 0.95
 """Share of a model's observations that lie in the pictures that they are of, if it is of this capture."""
 
 
-@dataclass(frozen=True)
-class SplitPart:
-    """The views of one split, the missing photos, and notes on where photos are read from."""
-
-    views: tuple[View, ...] = ()
-    missing: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
-
-def read_part(path: Path, downscale: int | None) -> SplitPart:
-    """All frames of a file."""
-    document = read_document(path)
-    (part,) = _views(path, document, path.parent, [_frames(path, document)], downscale)
-    return part
-
-
 def read_splits(path: Path, base: Path, downscale: int | None) -> tuple[dict, SplitPart, SplitPart]:
     """The document of a nerfstudio or instant-ngp file in a capture's folder `base` or below it, and its
     frames to train on and to test with."""
     document = read_document(path)
-    frames = _frames(path, document)
+    if not (frames := list(enumerate(read_frames(path, document)))):
+        raise NoViews(
+            f'{path}: its list of "frames" is empty, expected one per photo; export the poses again'
+        )
     *splits, notes = _split(path, document, frames)
     train, test = _views(path, document, base, splits, downscale)
     return document, replace(train, notes=(*train.notes, *notes)), test
@@ -68,68 +53,36 @@ Numbered = tuple[int, dict]
 """A frame and its place in the file."""
 
 
-def _frames(path: Path, document: dict) -> list[Numbered]:
-    frames = read_frames(path, document)
-    if not frames:
-        raise NoViews(
-            f'{path}: its list of "frames" is empty, expected one per photo; export the poses again'
-        )
-    return list(enumerate(frames))
-
-
 def _views(
     path: Path, document: dict, base: Path, splits: Sequence[list[Numbered]], downscale: int | None
-) -> tuple[SplitPart, ...]:
-    """Views of the frames of each split whose photo exists, their cameras scaled to what is read of it."""
-    splits = [sorted(frames, key=lambda item: natural(_file(item))) for frames in splits]
-    files = [_file(item) for part in splits for item in part]
-    homes = (str(path.parent.relative_to(base)), "") if path.parent != base else ("",)
-    matched = match_photos(path, base, files, downscale, homes)
-    if not matched.photos:
-        named = matched.missing[0] if matched.missing else "none"
-        raise NoViews(
-            f"{path}: no view is left, none of its {len(matched.missing)} photos such as {named} is there: "
-            f"{matched.hint}"
-        )
-    parts = [_part(path, document, frames, matched, downscale) for frames in splits]
-    notes = list(matched.notes)
-    if nameless := sum(not _file(item) for frames in splits for item in frames):
-        notes.append(f"{path}: {counted(nameless, 'frame has', 'frames have')} no file_path and no photo")
-    return (replace(parts[0], notes=(*notes, *parts[0].notes)), *parts[1:])
+) -> list[SplitPart]:
+    """Views of the frames of each split whose photo exists."""
+    unsure: list[str] = []
 
-
-def _part(
-    path: Path, document: dict, frames: list[Numbered], matched: MatchedPhotos, downscale: int | None
-) -> SplitPart:
-    def photo_of(item: Numbered) -> str:  # however its path is written
-        return os.path.normpath(matched.photos[_file(item)][0])
-
-    items = [item for item in frames if _file(item) in matched.photos]
-    items, notes = once(path, items, photo_of, lambda item: json.dumps(item[1].get("transform_matrix")))
-    unsure = []
-    names = dict(zip((i for i, _ in items), frame_names([frame for _, frame in items]), strict=True))
-
-    def read(item: Numbered) -> View:
-        (i, frame), where = item, frame_where(path, *item)
-        photo, folder = matched.photos[_file(item)]
-        header = read_image_header(photo)
+    def camera(item: Numbered, header: Header, folder: Folder) -> tuple[str, View, Path | None]:
+        frame, where = item[1], frame_where(path, *item)
         size, sure = _unstated_size(header, frame, document)
         if not sure:
-            unsure.append(photo.name)
-        view = frame_view(where, document, frame, names[i], size)
+            unsure.append(PurePosixPath(_file(item)).name)
+        view = frame_view(where, document, frame, "", size)
         mask = _mask(path, folder.factor, frame, where)
-        view = replace(view, seen=_stated_points(where, frame))
-        return on_photo(view, photo, header, where, mask, folder.reduction(header, downscale))
+        return where, replace(view, seen=_stated_points(where, frame)), mask
 
-    views, broken = read_sound(path, items, read, photo_of)
-    missing = tuple(_file(item) for item in frames if _file(item) not in matched.photos)
-    turned = [
-        f"{path}: EXIF turns {counted(len(unsure), 'photo', 'photos')}, such as {name}, and without w and h "
-        "nothing tells whether the poses are of them so: they are read as stored"
-        for name in unsure[:1]
-    ]
-    notes = (*notes, *broken, *turned, *repair_notes(path, views))
-    return SplitPart(tuple(views), missing, notes)
+    def pose_of(item: Numbered) -> str:
+        return json.dumps(item[1].get("transform_matrix"))
+
+    homes = (str(path.parent.relative_to(base)), "") if path.parent != base else ("",)
+    listed = [[(_file(item), item) for item in frames] for frames in splits]
+    parts = read_listed(path, base, listed, camera, downscale, homes, pose_of)
+    notes = []
+    if nameless := sum(not file for frames in listed for file, _ in frames):
+        notes.append(f"{path}: {counted(nameless, 'frame has', 'frames have')} no file_path and no photo")
+    if unsure:
+        notes.append(
+            f"{path}: EXIF turns {counted(len(unsure), 'photo', 'photos')}, such as {unsure[0]}, and without "
+            "w and h nothing tells whether the poses are of them so: they are read as stored"
+        )
+    return [replace(parts[0], notes=(*parts[0].notes, *notes)), *parts[1:]]
 
 
 def _unstated_size(header: Header, frame: dict, document: dict) -> tuple[tuple[int, int], bool]:
@@ -254,7 +207,7 @@ class Sparse:
             return tuple(replace(view, seen=None) for view in views)
         few, with_ranges = _sample(self.points), []
         for view in views:
-            near, far = depth_range(view.camera_to_world, few[_seen(view, few)])
+            near, far = depth_range(view.camera_to_world, few[view.shown(few)[3]])
             seen = view.seen if self.seen is None else self.seen.get(_photo_key(view))
             if seen is not None and self.seen is None and self.points.thinned > 1:
                 seen = seen[seen % self.points.thinned == 0] // self.points.thinned
@@ -275,30 +228,21 @@ def sparse_points(path: Path, document: dict, views: tuple[View, ...], most: int
     """The points of the COLMAP model that the capture was made from, where it lies beside and is of the same
     photos, or else those that `ply_file_path` names, at most so many; and a note where they were to be there
     but are not."""
-    written, sparse = written_path(document, "ply_file_path"), Sparse()
-    ply = find_file(path.parent, written) if written else None
+    written, notes, model, cloud = written_path(document, "ply_file_path"), [], None, None
+    points, seen, ply = None, None, find_file(path.parent, written) if written else None
     if "applied_transform" in document and (folder := colmap.model_folder(path.parent)) is not None:
-        try:
-            points, seen = colmap.read_points(folder, most)
-        except ResourceError:
-            raise
-        except FormatError as error:
-            sparse = Sparse(notes=(f"{error}; {path} is read without that model",))
-        else:
-            sparse = _agreeing(Sparse(_placed(path, document, points, views), seen), views)
-    if sparse.seen is None and ply:
-        try:
-            points = read_ply_points(ply, most)
-        except ResourceError:
-            raise
-        except FormatError as error:
-            sparse = replace(sparse, notes=(*sparse.notes, f"{error}; {path} is read without these points"))
-        else:
-            sparse = Sparse(_placed(path, document, points, views), None, sparse.notes)
-    elif sparse.points is None and written:
-        missing = f"{path}: its sparse points {written} do not exist and are not used"
-        sparse = Sparse(notes=(*sparse.notes, missing))
-    return replace(sparse, notes=(*sparse.notes, *points_notes(ply or path, sparse.points)))
+        with noted(notes, f"{path} is read without that model"):
+            model = colmap.read_points(folder, most)
+    if model is not None:
+        points = _placed(path, document, model[0], views)
+        seen = model[1] if points is not None and _agrees(points, model[1], views) else None
+    if seen is None and ply:
+        with noted(notes, f"{path} is read without these points"):
+            cloud = read_ply_points(ply, most)
+        points = points if cloud is None else _placed(path, document, cloud, views)
+    elif points is None and written:
+        notes.append(f"{path}: its sparse points {written} do not exist and are not used")
+    return Sparse(points, seen, (*notes, *points_notes(ply or path, points)))
 
 
 def _placed(
@@ -309,17 +253,24 @@ def _placed(
     if points is None or not len(points.positions) or not views:
         return None
     candidates = [points, *(points.moved(matrix) for matrix in _applied(path, document))]
-    return max(candidates, key=lambda moved: _seen_share(moved, views))
+    some = views[:: max(1, len(views) // 20)]
+
+    def share(moved: SparsePoints) -> float:
+        """How many of the points some views show."""
+        few = _sample(moved)[::10]
+        return float(np.mean([view.shown(few)[3].mean() for view in some]))
+
+    return max(candidates, key=share)
 
 
-def _agreeing(sparse: Sparse, views: tuple[View, ...]) -> Sparse:
-    """Points without what a model says of photos that do not show them so: it is of others, or posed anew."""
-    seen_by_view = [(view, sparse.seen.get(_photo_key(view))) for view in views]
-    seen_by_view = [(view, seen) for view, seen in seen_by_view if seen is not None and len(seen)]
-    if sparse.points is None or not seen_by_view:
-        return replace(sparse, seen=None)
-    shown = np.concatenate([_seen(view, sparse.points.positions[seen]) for view, seen in seen_by_view])
-    return sparse if shown.mean() > AGREEING else replace(sparse, seen=None)
+def _agrees(points: SparsePoints, seen: Mapping[str, np.ndarray], views: tuple[View, ...]) -> bool:
+    """Whether photos show the points that a model says they do: if not, it is of others, or posed anew."""
+    shown = [
+        view.shown(points.positions[indices])[3]
+        for view in views
+        if (indices := seen.get(_photo_key(view))) is not None and len(indices)
+    ]
+    return bool(shown) and np.concatenate(shown).mean() > AGREEING
 
 
 def _applied(path: Path, document: dict) -> list[np.ndarray]:
@@ -338,16 +289,3 @@ def _applied(path: Path, document: dict) -> list[np.ndarray]:
 
 def _sample(points: SparsePoints) -> np.ndarray:
     return points.positions[:: max(1, len(points.positions) // MAX_PROJECTED)]
-
-
-def _seen(view: View, positions: np.ndarray) -> np.ndarray:
-    """Which of (N, 3) positions a view shows, if nothing hides them; distortion is left out."""
-    x, y, back = ((positions - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]).T
-    depth = np.where(back < 0, -back, np.inf)
-    column, row = view.cx + view.fl_x * x / depth, view.cy - view.fl_y * y / depth
-    return (back < 0) & (abs(column * 2 / view.width - 1) <= 1) & (abs(row * 2 / view.height - 1) <= 1)
-
-
-def _seen_share(points: SparsePoints, views: tuple[View, ...]) -> float:
-    few = _sample(points)[::10]
-    return float(np.mean([_seen(view, few).mean() for view in views[:: max(1, len(views) // 20)]]))

@@ -157,13 +157,8 @@ def undo(bundle: Path | str, output: Path | str) -> dict:
         "bytes": size,
         "undone": last.get("event", "edited"),
         "objects": names_of(last),
-        "more": depth(history_folder(output), output),
+        "more": len(chain(history_folder(output), output)),
     }
-
-
-def depth(folder: Path, bundle: Path | str) -> int:
-    """How many edits of a bundle can be undone, one after the other."""
-    return len(chain(folder, bundle))
 
 
 def history(bundle: Path | str) -> dict:
@@ -181,4 +176,4 @@ def history(bundle: Path | str) -> dict:
         }
         for entry in scene.history
     ]
-    return {"path": str(bundle), "undoable": depth(history_folder(bundle), bundle), "history": entries}
+    return {"path": str(bundle), "undoable": len(chain(history_folder(bundle), bundle)), "history": entries}

@@ -8,6 +8,8 @@ upward axes is not it: of cameras that look down from one side it leans away fro
 
 import numpy as np
 
+from formats.capture_frame import sphere
+
 APART = 0.1
 """Axes lie in a plane if the mean square of their distances from it is less than this share of the mean
 square of their spread across their main direction in it."""
@@ -80,9 +82,7 @@ def _held_both_ways(rights: np.ndarray, ups: np.ndarray) -> np.ndarray | None:
     two axes of each camera, (N, 3) each, is square. None where there is none, or not both kinds of photos."""
     if len(rights) < SEVERAL:
         return None
-    heights = (np.arange(GRID) + 0.5) / GRID  # of a hemisphere, evenly spaced on a spiral
-    turns, radii = np.arange(GRID) * np.pi * (3 - 5**0.5), np.sqrt(1 - heights**2)
-    grid = np.stack([radii * np.cos(turns), radii * np.sin(turns), heights])
+    grid = sphere(2 * GRID)[:GRID].T  # the upper half
     few = slice(None, None, -(-len(rights) // GRID))
     up = grid[:, np.minimum((rights[few] @ grid) ** 2, (ups[few] @ grid) ** 2).mean(0).argmin()]
     for _ in range(5):

@@ -1,7 +1,6 @@
 """glTF's buffers and accessors as numpy arrays; counts are checked against bytes before they are believed."""
 
 import base64
-import binascii
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
 
@@ -70,9 +69,8 @@ class Buffers:
     def view(self, index: int) -> memoryview:
         entry = self.item("buffer_views", index)
         for name in MESHOPT:
-            if name in entry.extensions:
+            if (packed := entry.extension(name, schema.Meshopt, self.path)) is not None:
                 if index not in self.unpacked:
-                    packed = schema.typed(entry.extensions[name], schema.Meshopt, f"{self.path}: {name}")
                     self.unpacked[index] = self._unpack(packed, name)
                 return self.unpacked[index][: entry.byte_length]
         return self._cut(entry.buffer, entry.byte_offset, entry.byte_length, f"buffer view {index}")
@@ -126,13 +124,13 @@ class Buffers:
             table = np.broadcast_to(np.zeros((), kind), (accessor.count, width))
         else:
             stride = self.item("buffer_views", accessor.buffer_view).byte_stride
-            table = self._table(
-                accessor.buffer_view, accessor.byte_offset, stride, accessor.count, width, kind, where
-            )
+            table = self._table(accessor, stride, accessor.count, width, kind, where)
         return table if accessor.sparse is None else self._patched(table, accessor.sparse, where)
 
-    def _table(self, view, offset, stride, count, width, kind, where) -> np.ndarray:
-        data, size = self.view(view), width * kind.itemsize
+    def _table(
+        self, part: schema.Accessor | schema.SparsePart, stride: int, count: int, width: int, kind, where: str
+    ) -> np.ndarray:
+        data, offset, size = self.view(part.buffer_view), part.byte_offset, width * kind.itemsize
         stride = stride or size
         if stride < size:
             raise BadMesh(f"{where} has elements of {size} bytes, {stride} apart; export the file again")
@@ -148,12 +146,9 @@ class Buffers:
     def _patched(self, base: np.ndarray, sparse: schema.Sparse, where: str) -> np.ndarray:
         if sparse.count > len(base) or sparse.indices.component_type not in (5121, 5123, 5125):
             raise BadMesh(f"{where} replaces {sparse.count:,} of its {len(base):,} elements; export it again")
-        part, kind = sparse.indices, np.dtype(COMPONENTS[sparse.indices.component_type])
-        indices = self._table(part.buffer_view, part.byte_offset, 0, sparse.count, 1, kind, where)[:, 0]
-        part = sparse.values
-        values = self._table(
-            part.buffer_view, part.byte_offset, 0, sparse.count, base.shape[1], base.dtype, where
-        )
+        kind = np.dtype(COMPONENTS[sparse.indices.component_type])
+        indices = self._table(sparse.indices, 0, sparse.count, 1, kind, where)[:, 0]
+        values = self._table(sparse.values, 0, sparse.count, base.shape[1], base.dtype, where)
         if len(indices) and indices.max() >= len(base):
             raise BadMesh(f"{where} replaces an element that it does not have; export the file again")
         patched = base.copy()
@@ -197,11 +192,10 @@ def data_uri(uri: str, where: str) -> bytes:
     head, comma, body = uri.partition(",")
     if not comma:
         raise BadMesh(f"{where}: a data URI without data")
+    data = unquote_to_bytes(body)
     if not head.rstrip().lower().endswith(";base64"):
-        return unquote_to_bytes(body)
+        return data
     try:
-        if "%" in body:
-            body = unquote_to_bytes(body)
-        return base64.b64decode(body + ("=" if isinstance(body, str) else b"=") * (-len(body) % 4))
-    except (binascii.Error, ValueError) as error:
+        return base64.b64decode(data + b"=" * (-len(data) % 4))
+    except ValueError as error:
         raise BadMesh(f"{where}: the data URI is no base64 ({error}); export the file again") from error

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.errors import BadMesh, LimitExceeded, MissingExtra
+from formats.errors import BadMesh, LimitExceeded, MissingExtra, listed
 from formats.rotations import matrices
 from formats.safe_input import read_input
 from formats.surfaces import gltf_schema as schema
@@ -33,7 +33,6 @@ from formats.surfaces.surface import (
     check_budget,
     check_indices,
     laid,
-    listed,
     sound_colours,
 )
 
@@ -185,9 +184,7 @@ class _Reader:
         """Nodes of the default scene, without those that are hidden."""
         document = self.document
         if document.scene is None and not document.scenes:
-            roots = set(range(len(document.nodes))) - {
-                child for node in document.nodes for child in node.children
-            }
+            roots = set(order) - {child for node in document.nodes for child in node.children}
         else:
             chosen = document.scene or 0
             scene = self.buffers.item("scenes", chosen)
@@ -202,11 +199,10 @@ class _Reader:
             if index not in within:
                 continue
             node = document.nodes[index]
-            if VISIBILITY in node.extensions:
-                raw = node.extensions[VISIBILITY]
-                if not schema.typed(raw, schema.Visibility, f"{self.path}: {VISIBILITY}").visible:
-                    self.hidden += 1
-                    continue
+            visibility = node.extension(VISIBILITY, schema.Visibility, self.path)
+            if visibility is not None and not visibility.visible:
+                self.hidden += 1
+                continue
             within.update(node.children)
             shown.append(index)
         if self.hidden:
@@ -233,13 +229,13 @@ class _Reader:
         return surfaces
 
     def _instances(self, node: schema.Node, world: np.ndarray) -> list[np.ndarray]:
-        if INSTANCING not in node.extensions:
+        instancing = node.extension(INSTANCING, schema.Instancing, self.path)
+        if instancing is None:
             return [world]
-        typed = schema.typed(node.extensions[INSTANCING], schema.Instancing, f"{self.path}: {INSTANCING}")
         given = {
-            name: self.buffers.numbers(typed.attributes[name], (width,)).astype(np.float64)
+            name: self.buffers.numbers(instancing.attributes[name], (width,)).astype(np.float64)
             for name, width in (("TRANSLATION", 3), ("ROTATION", 4), ("SCALE", 3))
-            if name in typed.attributes
+            if name in instancing.attributes
         }
         counts = {len(rows) for rows in given.values()}
         if len(counts) != 1:
@@ -272,16 +268,17 @@ class _Shape:
 
     def __init__(self, reader: _Reader, primitive: schema.Primitive, where: str):
         self.reader, self.buffers, self.primitive, self.where = reader, reader.buffers, primitive, where
+        self.called = where.removeprefix(f"{reader.path}: ")
         self.unpacked = self._draco()
         if "POSITION" not in primitive.attributes:
             self.faces, self.chosen = np.empty((0, 3), np.int32), np.empty(0, np.int64)
-            reader.notes.add("has no positions and is left out", where.removeprefix(f"{reader.path}: "))
+            reader.notes.add("has no positions and is left out", self.called)
             return
         count = self._count()
         indices, mode = self._indices(count), TRIANGLES if self.unpacked else primitive.mode
         if mode == TRIANGLES and len(indices) % 3:
             left = "counts corners that are no whole triangles; the last ones are left out"
-            reader.notes.add(left, where.removeprefix(f"{reader.path}: "))
+            reader.notes.add(left, self.called)
         faces = _triangles(indices, mode)
         check_indices(where, faces.reshape(-1), count)
         used = np.zeros(count, bool)
@@ -305,17 +302,17 @@ class _Shape:
             raise BadMesh(f"{self.where}: its indices are {rows.dtype}, expected whole numbers without sign")
         if len(rows) and rows.max() == np.iinfo(rows.dtype).max:
             reserved = "counts up to the index that glTF reserves; it is shown as a vertex like others"
-            self.reader.notes.add(reserved, self.where.removeprefix(f"{self.reader.path}: "))
+            self.reader.notes.add(reserved, self.called)
         return rows[:, 0].astype(np.int64)
 
     def _draco(self) -> dict[str, np.ndarray]:
         """Decoded attributes by name, and "indices"; nothing where the primitive is not compressed, or where
         it has its plain numbers too and the library is missing."""
-        if DRACO not in self.primitive.extensions:
+        draco = self.primitive.extension(DRACO, schema.Draco, self.where)
+        if draco is None:
             return {}
-        typed = schema.typed(self.primitive.extensions[DRACO], schema.Draco, f"{self.where}: {DRACO}")
         try:
-            return draco_arrays(bytes(self.buffers.view(typed.buffer_view)), typed.attributes, self.where)
+            return draco_arrays(bytes(self.buffers.view(draco.buffer_view)), draco.attributes, self.where)
         except MissingExtra:
             accessors = [self.buffers.item("accessors", i) for i in self.primitive.attributes.values()]
             if any(accessor.buffer_view is None for accessor in accessors):
@@ -388,7 +385,7 @@ class _Shape:
         uv = self._morphed(f"TEXCOORD_{slot.tex_coord}", (2,), weights)
         if uv is None:
             lost = f"has a texture, but no TEXCOORD_{slot.tex_coord} for it; its upper left corner is shown"
-            self.reader.notes.add(lost, self.where.removeprefix(f"{self.reader.path}: "))
+            self.reader.notes.add(lost, self.called)
             uv = np.zeros((len(self.chosen), 2), np.float32)
         if slot.transform is not None:
             uv = uv @ slot.transform[:, :2].T + slot.transform[:, 2]

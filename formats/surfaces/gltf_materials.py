@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from formats.errors import FormatError
+from formats.errors import listed
 from formats.surfaces import gltf_schema as schema
 from formats.surfaces.accessors import Buffers, data_uri, is_data
-from formats.surfaces.pictures import read_picture, share_of
-from formats.surfaces.surface import Notes, Texture, listed
+from formats.surfaces.pictures import Pictures
+from formats.surfaces.surface import Notes, Texture
 
 GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
 TRANSFORM = "KHR_texture_transform"
@@ -55,10 +55,9 @@ class Materials:
     def __init__(self, document: schema.Document, buffers: Buffers, notes: Notes):
         self.document, self.buffers, self.notes = document, buffers, notes
         self.looks: dict[int, Appearance] = {}
-        self.pictures: dict[int, np.ndarray | None] = {}
         self.used: set[int] = set()
         """Of the document's images, those that are shown."""
-        self.share = share_of(len(document.images), notes)
+        self.pictures = Pictures(len(document.images), notes)
 
     def look(self, index: int | None) -> Appearance:
         """What material `index` shows. Raises BadMesh."""
@@ -73,8 +72,8 @@ class Materials:
         self._tell_unused(material, name)
         metallic = material.pbr_metallic_roughness
         factor, info = metallic.base_color_factor, metallic.base_color_texture
-        if GLOSSINESS in material.extensions:
-            glossy = self._extension(material, GLOSSINESS, schema.Glossiness)
+        glossy = material.extension(GLOSSINESS, schema.Glossiness, self.buffers.path)
+        if glossy is not None:
             required = GLOSSINESS in self.document.extensions_required
             if required or glossy.diffuse_factor or glossy.diffuse_texture:  # or it says nothing of colour
                 factor, info = glossy.diffuse_factor, glossy.diffuse_texture
@@ -86,9 +85,8 @@ class Materials:
         return Appearance(base, self._glow(material, name), cutoff, blend, not material.double_sided)
 
     def _glow(self, material: schema.Material, name: str) -> Slot | None:
-        strength = 1.0
-        if STRENGTH in material.extensions:
-            strength = self._extension(material, STRENGTH, schema.EmissiveStrength).emissive_strength
+        stated = material.extension(STRENGTH, schema.EmissiveStrength, self.buffers.path)
+        strength = 1.0 if stated is None else stated.emissive_strength
         factor = [max(strength, 0) * max(value, 0) for value in material.emissive_factor or (0, 0, 0)]
         if max(factor) == 0:
             return None
@@ -100,24 +98,18 @@ class Materials:
         if info is None:
             return Slot(colour, None, 0, None)
         tex_coord, transform = info.tex_coord, None
-        if TRANSFORM in info.extensions:
-            moved = self._extension(info, TRANSFORM, schema.TextureTransform)
+        moved = info.extension(TRANSFORM, schema.TextureTransform, self.buffers.path)
+        if moved is not None:
             transform = _transform(moved)
             tex_coord = tex_coord if moved.tex_coord is None else moved.tex_coord
         return Slot(colour, self._texture(info.index, name), tex_coord, transform)
-
-    def _extension(self, owner: schema.Part, name: str, kind):
-        return schema.typed(owner.extensions[name], kind, f"{self.buffers.path}: {name}")
 
     # --- textures -------------------------------------------------------------------------------------------
 
     def _texture(self, index: int, name: str) -> Texture | None:
         texture = self.buffers.item("textures", index)
-        sources = [
-            self._extension(texture, extension, schema.Sourced).source
-            for extension in PICTURE_EXTENSIONS
-            if extension in texture.extensions
-        ]
+        others = [texture.extension(n, schema.Sourced, self.buffers.path) for n in PICTURE_EXTENSIONS]
+        sources = [other.source for other in others if other is not None]
         for source in (*sources, texture.source):
             pixels = None if source is None else self._picture(source, name)
             if pixels is not None:
@@ -137,26 +129,17 @@ class Materials:
 
     def _picture(self, index: int, name: str) -> np.ndarray | None:
         """The pixels of an image, or None and a note where it cannot be read."""
-        if index not in self.pictures:
-            image = self.buffers.item("images", index)
-            label = image_label(image, index)
-            try:
-                data, label = self._image_bytes(image, index, label)
-                self.pictures[index] = read_picture(data, label, self.share, self.notes)
-            except FormatError as error:
-                self.pictures[index] = None
-                self.notes.add(f"has a texture that is not shown: {error}", name)
-        return self.pictures[index]
+        image = self.buffers.item("images", index)
+        return self.pictures.get(index, lambda: self._image_bytes(image, image_label(image, index)), name)
 
-    def _image_bytes(self, image: schema.Image, index: int, label: str) -> tuple[bytes, str]:
+    def _image_bytes(self, image: schema.Image, label: str) -> tuple[bytes, str]:
         if image.buffer_view is not None:
             return bytes(self.buffers.view(image.buffer_view)), label
         if image.uri is None:
             return b"", label
         if is_data(image.uri):
             return data_uri(image.uri, label), label
-        data, path = self.buffers.beside.read(image.uri, uri=True)
-        return data, path.name
+        return self.buffers.beside.read(image.uri, uri=True)
 
     # --- notes ----------------------------------------------------------------------------------------------
 
@@ -171,9 +154,8 @@ class Materials:
         unused = [slot for slot, info in slots.items() if info is not None]
         known = (GLOSSINESS, STRENGTH, UNLIT)
         unused += [extension for extension in material.extensions if extension not in known]
-        if GLOSSINESS in material.extensions:
-            glossy = self._extension(material, GLOSSINESS, schema.Glossiness)
-            unused += ["specularGlossinessTexture"] if glossy.specular_glossiness_texture else []
+        glossy = material.extension(GLOSSINESS, schema.Glossiness, self.buffers.path)
+        unused += ["specularGlossinessTexture"] if glossy and glossy.specular_glossiness_texture else []
         if unused:
             self.notes.add(f"shown unlit, by colour alone; not used: {listed(unused)}", name)
 
@@ -183,7 +165,7 @@ class Materials:
         unused = [material.name or f"material {i}" for i, material in materials if i not in self.looks]
         if unused:
             self.notes.add(f"materials that nothing shown has: {listed(unused)}")
-        tried = self.used | {index for index, pixels in self.pictures.items() if pixels is None}
+        tried = self.used | {index for index, pixels in self.pictures.pixels.items() if pixels is None}
         unused = [image_label(i, n) for n, i in enumerate(self.document.images) if n not in tried]
         if unused:
             self.notes.add(f"pictures that no shown colour uses: {listed(unused)}")

@@ -28,6 +28,10 @@ class Part(msgspec.Struct, rename="camel", gc=False):
 
     extensions: Extensions = {}
 
+    def extension(self, name: str, kind: type[Kind], where: object) -> Kind | None:
+        """One of its extensions, None without it. Raises BadJson, BadMesh."""
+        return typed(self.extensions[name], kind, f"{where}: {name}") if name in self.extensions else None
+
 
 class Named(Part):
     name: str = ""
@@ -133,14 +137,12 @@ class Sourced(Part):
 
 class Sampler(Named):
     mag_filter: int | None = None
-    min_filter: int | None = None
     wrap_s: int = 10497
     wrap_t: int = 10497
 
 
 class Image(Named):
     uri: str | None = None
-    mime_type: str = ""
     buffer_view: Index | None = None
 
 

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -28,6 +29,20 @@ def numbers_in(text: str, kind: type = np.float64) -> np.ndarray:
         except (DeprecationWarning, ValueError):
             word = next((word for word in text.split() if not _is_number(word)), text)
             raise ValueError(f"{word[:40]!r} in place of a number") from None
+
+
+def table(lines: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All numbers of lines, and (n,) how many each line has and where they begin. Raises ValueError."""
+    widths = np.array([len(line.split()) for line in lines], np.int64)
+    numbers = numbers_in(" ".join(lines))
+    if len(numbers) != widths.sum():
+        raise ValueError("words that are no numbers")
+    return numbers, widths, np.cumsum(widths) - widths
+
+
+def within(counts: np.ndarray) -> np.ndarray:
+    """(sum of counts,) 0, 1, ... in each group of so many."""
+    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def western(name: str) -> str:

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from formats.errors import FormatError
+from formats.errors import listed
 from formats.surfaces.lines import lines_of
 from formats.surfaces.named_files import Beside
-from formats.surfaces.pictures import read_picture, share_of
-from formats.surfaces.surface import Notes, Paint, Texture, listed, opaque
+from formats.surfaces.pictures import Pictures
+from formats.surfaces.surface import Notes, Paint, Texture, opaque
 
 ONE_WORD = ("-blendu", "-blendv", "-bm", "-boost", "-cc", "-clamp", "-imfchan", "-texres", "-type")
 ARGUMENTS = {**dict.fromkeys(ONE_WORD, 1), "-mm": 2}
@@ -169,11 +169,10 @@ class Appearances:
 
     def __init__(self, materials: dict[str, Material], beside: Beside, notes: Notes):
         self.materials, self.beside, self.notes = materials, beside, notes
-        self.pictures: dict[str, np.ndarray | None] = {}
         self.looks: dict[str, Appearance] = {}
         maps = [item for material in materials.values() for item in material.maps.items()]
         named = {m.name for word, m in maps if word in SHOWN}
-        self.share = share_of(len(named), notes)
+        self.pictures = Pictures(len(named), notes)
 
     def look(self, name: str) -> Appearance:
         if name not in self.looks:
@@ -221,10 +220,8 @@ class Appearances:
         return np.ones(3) if texture is not None else np.clip(kd, 0, 1)
 
     def _glow(self, material: Material, called: str) -> Paint | None:
-        ke, texture = (
-            material.colours.get("ke", (0, 0, 0)),
-            self._texture(material.maps.get("map_ke"), called),
-        )
+        ke = material.colours.get("ke", (0, 0, 0))
+        texture = self._texture(material.maps.get("map_ke"), called)
         if max(ke) <= 0:
             return None
         self.notes.add("glows, which is added to its colour", called)
@@ -233,14 +230,7 @@ class Appearances:
     def _texture(self, picture: Map | None, called: str) -> Texture | None:
         if picture is None:
             return None
-        if picture.name not in self.pictures:
-            try:
-                data, path = self.beside.read(picture.name)
-                self.pictures[picture.name] = read_picture(data, path.name, self.share, self.notes)
-            except FormatError as error:
-                self.pictures[picture.name] = None
-                self.notes.add(f"has a texture that is not shown: {error}", called)
-        pixels = self.pictures[picture.name]
+        pixels = self.pictures.get(picture.name, lambda: self.beside.read(picture.name), called)
         wrap = "clamp" if picture.options.get("-clamp", ["off"])[0].lower() == "on" else "repeat"
         return None if pixels is None else Texture(pixels, (wrap, wrap))
 

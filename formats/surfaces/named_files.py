@@ -2,19 +2,18 @@
 
 import os
 import re
-import unicodedata
 from pathlib import Path
 from urllib.parse import unquote
 
 from formats.errors import FormatError, LimitExceeded, MissingFile, OutsideFolder
-from formats.safe_input import read_input
+from formats.names import folded
+from formats.safe_input import MAX_BYTES, read_input
 from formats.surfaces.lines import western, without_comment
 
 SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 """One letter alone is a drive of Windows."""
 LOCAL = re.compile(r"file:(?=/)", re.IGNORECASE)
 ABSOLUTE = re.compile(r"[A-Za-z]:|/|\\")
-MAX_FILE = 2**31
 MAX_NAME = 1024
 
 
@@ -27,21 +26,21 @@ class Beside:
         self.root = os.path.realpath(self.folder / os.pardir)
         self.bytes_read = 0
 
-    def read(self, name: str, *, uri: bool = False) -> tuple[bytes, Path]:
-        """The bytes of a named file and where it was found.
+    def read(self, name: str, *, uri: bool = False) -> tuple[bytes, str]:
+        """The bytes of a named file and the name that it has.
 
         A `uri` is percent-decoded. Where the path is not there, its last part is looked for in the mesh's own
         folder, since paths are often those of another computer; letters may be in another case. Raises
         MissingFile, OutsideFolder, and what `read_input` raises.
         """
         path = self.find(name, uri=uri)
-        data = read_input(path, MAX_FILE)
+        data = read_input(path)
         self.bytes_read += len(data)
-        if self.bytes_read > 2 * MAX_FILE:
+        if self.bytes_read > 2 * MAX_BYTES:
             raise LimitExceeded(
-                f"{name}: the files that the mesh names have more than {2 * MAX_FILE:,} bytes"
+                f"{name}: the files that the mesh names have more than {2 * MAX_BYTES:,} bytes"
             )
-        return data, path
+        return data, path.name
 
     def find(self, name: str, *, uri: bool = False) -> Path:
         if len(name) > MAX_NAME:
@@ -79,7 +78,7 @@ class Beside:
                 self._check(where)
                 continue
             if not os.path.lexists(there):
-                same = [entry for entry in _entries(where) if _key(entry) == _key(part)]
+                same = [entry for entry in _entries(where) if folded(entry) == folded(part)]
                 if not same:
                     return None
                 there = where / min(same)
@@ -91,11 +90,6 @@ class Beside:
         real = os.path.realpath(path)
         if os.path.commonpath([real, self.root]) != self.root:
             raise OutsideFolder(f"{path}: lies outside of {self.root}; put it beside the mesh")
-
-
-def _key(name: str) -> str:
-    """Equal for names that differ in case, or in how accents are put together."""
-    return unicodedata.normalize("NFC", name).casefold()
 
 
 def _entries(folder: Path) -> list[str]:

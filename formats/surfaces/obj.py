@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.errors import BadMesh, FormatError
+from formats.errors import BadMesh, FormatError, listed
 from formats.safe_input import read_input
-from formats.surfaces.lines import lines_of, numbers_in, western, without_comment
+from formats.surfaces.lines import lines_of, numbers_in, table, western, without_comment
 from formats.surfaces.mtl import FIRST_TILE, TILES_ACROSS, Appearances, Material, check_repeated, parse_mtl
 from formats.surfaces.named_files import Beside
 from formats.surfaces.polygons import triangulated
@@ -15,14 +15,10 @@ from formats.surfaces.surface import (
     Notes,
     Paint,
     Surface,
-    check_budget,
-    check_indices,
     laid,
-    listed,
     sound_colours,
 )
 
-MAX_FILE = 2**31
 AT_ONCE = 1 << 18
 """Corners of faces that are kept as text."""
 FREE_FORM = ("curv", "curv2", "surf", "cstype", "parm", "bzp", "bsp", "cdc", "cdp")
@@ -39,7 +35,7 @@ POLYPAINT = re.compile(rb"^#MRGB +([0-9a-fA-F]+)", re.MULTILINE)
 
 def read_obj(path: Path | str, notes: Notes) -> list[Surface]:
     """All faces, a surface for each material. Raises BadMesh, LimitExceeded, MissingFile."""
-    data = read_input(path, MAX_FILE)
+    data = read_input(path)
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise BadMesh(f"{path}: is text in UTF-16; save the mesh in UTF-8")
     text = _Text(path, notes)
@@ -131,32 +127,17 @@ def _numbers(tokens: list[str]) -> np.ndarray:
     return np.array([(int(a), int(b or 0)) for a, b in parts], np.int64)
 
 
-def _table(lines: list[str]) -> list[np.ndarray]:
-    """Rows of numbers, as one array where all have as many, else one for each row."""
-    widths = {len(line.split()) for line in lines[:1000]}
-    if len(widths) == 1:
-        width = widths.pop()
-        if width and all(len(line.split()) == width for line in lines):
-            return numbers_in(" ".join(lines)).reshape(-1, width)
-    return [numbers_in(line) for line in lines]
-
-
-def _points(lines: list[str], path: Path | str) -> tuple[np.ndarray, np.ndarray | None]:
+def _points(lines: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
     """(V, 3) positions, and (V, 4) colours where vertices have them: x y z, then w, or r g b, or r g b a."""
-    rows = _table(lines)
-    if isinstance(rows, list):
-        if any(len(row) < 3 for row in rows):
-            raise BadMesh(f"{path}: a vertex has fewer than three numbers; export the mesh again")
-        coloured = [row[3:6] if len(row) >= 6 else np.ones(3) for row in rows]
-        colours = np.array(coloured) if any(len(row) >= 6 for row in rows) else None
-        positions = np.array([row[:3] for row in rows])
-    else:
-        if rows.shape[1] < 3:
-            raise BadMesh(f"{path}: a vertex has fewer than three numbers; export the mesh again")
-        positions, colours = rows[:, :3], rows[:, 3:6] if rows.shape[1] >= 6 else None
-    if colours is not None:
-        colours = sound_colours(colours / (255 if np.nanmax(colours, initial=0) > 1 else 1))
-    return np.ascontiguousarray(positions), colours
+    numbers, widths, starts = table(lines)
+    if (widths < 3).any():
+        raise ValueError("a vertex of fewer than three numbers")
+    positions, coloured = numbers[starts[:, None] + np.arange(3)], widths >= 6
+    if not coloured.any():
+        return positions, None
+    colours, rgb = np.ones((len(lines), 3)), numbers[starts[coloured, None] + np.arange(3, 6)]
+    colours[coloured] = rgb / (255 if np.nanmax(rgb, initial=0) > 1 else 1)
+    return positions, sound_colours(colours)
 
 
 def _polypaint(digits: bytes, count: int, notes: Notes) -> np.ndarray | None:
@@ -170,27 +151,26 @@ def _polypaint(digits: bytes, count: int, notes: Notes) -> np.ndarray | None:
 
 def _uvs(lines: list[str]) -> np.ndarray:
     """(n, 2), v up; v is 0 where it is not given."""
-    rows = _table(lines) if lines else np.empty((0, 2))
-    if not isinstance(rows, list) and rows.shape[1] > 1:
-        return rows[:, :2]
-    return np.array([[*row[:2], 0, 0][:2] for row in rows], np.float64).reshape(-1, 2)
+    numbers, widths, starts = table(lines)
+    uvs, both = np.zeros((len(lines), 2)), widths > 1
+    uvs[widths > 0, 0] = numbers[starts[widths > 0]]
+    uvs[both, 1] = numbers[starts[both] + 1]
+    return uvs
 
 
 def _surfaces(text: _Text, path: Path | str, n_bytes: int, painted: bytes, notes: Notes) -> list[Surface]:
     if not text.counts:
         return []
     counts, used = np.array(text.counts), np.array(text.used)
-    check_budget(path, int((counts - 2).sum()), n_bytes)
     try:
-        positions, colours = _points(text.points, path)
+        positions, colours = _points(text.points)
         uvs = _uvs(text.uvs)
     except (ValueError, OverflowError) as error:
         raise BadMesh(f"{path}: holds {error}; export the mesh again") from error
     if painted and colours is None:
         colours = _polypaint(painted, len(positions), notes)
     corners = np.concatenate(text.corners)
-    check_indices(path, corners[:, 0], len(positions))
-    corner_indices, polygon = triangulated(counts, corners[:, 0], positions)
+    corner_indices, polygon = triangulated(path, counts, corners[:, 0], positions, n_bytes)
     beside = Beside(path)
     materials = _materials(text, beside, path, notes)
     names = _chosen(text, materials, notes)
@@ -313,8 +293,7 @@ def _libraries(named: str, beside: Beside, path: Path | str, notes: Notes) -> li
         lost = []
         for name in names:
             try:
-                data, file = beside.read(name)
-                paths.append((data, file.name))
+                paths.append(beside.read(name))
             except FormatError as error:
                 lost.append(f"the library of materials {name!r} is not read: {error}")
         if paths:
@@ -323,9 +302,8 @@ def _libraries(named: str, beside: Beside, path: Path | str, notes: Notes) -> li
         notes.add(sentence)
     if not paths:
         try:
-            data, file = beside.read(Path(path).with_suffix(".mtl").name)
+            paths.append(beside.read(Path(path).with_suffix(".mtl").name))
         except FormatError:
             return []
-        notes.add(f"{file.name} is taken for its materials")
-        paths.append((data, file.name))
+        notes.add(f"{paths[0][1]} is taken for its materials")
     return paths

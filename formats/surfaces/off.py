@@ -7,18 +7,17 @@ import numpy as np
 
 from formats.errors import BadMesh
 from formats.safe_input import read_input
-from formats.surfaces.lines import numbers_in
+from formats.surfaces.lines import table, within
 from formats.surfaces.polygons import triangulated
-from formats.surfaces.surface import Notes, Surface, check_budget, check_indices, sound_colours
+from formats.surfaces.surface import Notes, Surface, sound_colours
 
-MAX_FILE = 2**30
 KEYWORD = re.compile(r"(ST)?(C)?(N)?OFF$")
 OTHER = re.compile(r"(ST)?C?N?(4|4?n)OFF$")
 
 
 def read_off(path: Path | str, notes: Notes) -> list[Surface]:
     """All faces. Raises BadMesh, LimitExceeded, MissingFile."""
-    data = read_input(path, MAX_FILE)
+    data = read_input(path)
     rows = (line.partition("#")[0].strip() for line in data.decode("latin-1").splitlines())
     lines = [row for row in rows if row]
     keyword, n_points, n_faces, at = _header(path, lines)
@@ -27,9 +26,9 @@ def read_off(path: Path | str, notes: Notes) -> list[Surface]:
             f"{path}: ends before the last of {n_points + n_faces:,} lines; copy or export it again"
         )
     try:
-        numbers, widths, starts = _table(lines[at : at + n_points])
-        if (widths < 3).any():
-            raise ValueError("a vertex of fewer than three numbers")
+        numbers, widths, starts = table(lines[at : at + n_points])
+        if (widths < 3).any() or not np.isfinite(numbers).all():
+            raise ValueError("a vertex of fewer than three numbers, or of NaN or infinity")
         positions = numbers[starts[:, None] + np.arange(3)]
         first = 6 if "N" in keyword else 3
         behind = widths - first - (2 if "ST" in keyword else 0)
@@ -38,20 +37,17 @@ def read_off(path: Path | str, notes: Notes) -> list[Surface]:
         skipped = np.full(n_points, first)
         colours = _colours(numbers, starts, skipped, behind, lines[at : at + n_points], notes)
         lines = lines[at + n_points : at + n_points + n_faces]
-        numbers, widths, starts = _table(lines)
+        numbers, widths, starts = table(lines)
         counts = numbers[starts].astype(np.int64)
-        if (counts < 0).any() or (counts + 1 > widths).any():
+        if (counts < 0).any() or (counts + 1 > widths).any() or not np.isfinite(numbers).all():
             raise ValueError("a face of fewer corners than it counts")
     except (ValueError, OverflowError) as error:
         raise BadMesh(f"{path}: the mesh cannot be loaded ({error}); export it again") from error
     face_colours = _colours(numbers, starts, counts + 1, widths - counts - 1, lines, notes)
     if (widths - counts == 2).any():
         notes.add("colours that are numbers of a palette are not shown")
-    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    corners = numbers[np.repeat(starts + 1, counts) + within].astype(np.int64)
-    check_budget(path, int(np.maximum(counts - 2, 0).sum()), len(data))
-    check_indices(path, corners, len(positions))
-    corner_indices, polygon = triangulated(counts, corners, positions)
+    corners = numbers[np.repeat(starts + 1, counts) + within(counts)].astype(np.int64)
+    corner_indices, polygon = triangulated(path, counts, corners, positions, len(data))
     faces = corners[corner_indices].astype(np.int32).reshape(-1, 3)
     face_colours = None if face_colours is None else face_colours[polygon]
     return [Surface(positions, faces, colours=colours, face_colours=face_colours)]
@@ -70,15 +66,6 @@ def _header(path: Path | str, lines: list[str]) -> tuple[str, int, int, int]:
     if not 2 <= len(words) <= 3 or not all(word.isdecimal() and len(word) < 16 for word in words):
         raise BadMesh(f"{path}: does not begin with OFF and counts of vertices and faces; export it again")
     return keyword[0] if keyword else "OFF", int(words[0]), int(words[1]), at
-
-
-def _table(lines: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All numbers, and how many each line has and where they begin."""
-    widths = np.array([len(line.split()) for line in lines], np.int64)
-    numbers = numbers_in(" ".join(lines))
-    if len(numbers) != widths.sum() or not np.isfinite(numbers).all():
-        raise ValueError("words that are no numbers")
-    return numbers, widths, np.cumsum(widths) - widths
 
 
 def _colours(numbers, starts, skipped, widths, lines: list[str], notes: Notes) -> np.ndarray | None:

@@ -3,11 +3,12 @@
 import io
 import math
 import warnings
+from collections.abc import Callable, Hashable
 
 import numpy as np
 
-from formats.errors import BadImage, LimitExceeded, MissingExtra, printable
-from formats.images import DECODING_ERRORS
+from formats.errors import BadImage, FormatError, LimitExceeded, MissingExtra, printable
+from formats.images import DECODING_ERRORS, eight_bits
 from formats.surfaces.surface import Notes
 
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "GIF", "TIFF", "DDS", "TGA")
@@ -31,26 +32,44 @@ def read_picture(data: bytes, name: str, share: int, notes: Notes) -> np.ndarray
     Raises BadImage for what is no picture in a known format, LimitExceeded (before decoding) for what would
     take too much memory, and MissingExtra for KTX2 without its library.
     """
+    from PIL import Image
+
     if data.startswith(KTX2):
-        return _reduced_array(_ktx2(data, name), name, share, notes)
-    from PIL.Image import DecompressionBombError
+        return _pixels(Image.fromarray(_ktx2(data, name)), len(data), name, share, notes)
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             image = _identified(data, name)
             return _pixels(image, len(data), name, share, notes)
-    except (*DECODING_ERRORS, RuntimeError, DecompressionBombError) as error:
+    except (*DECODING_ERRORS, RuntimeError, Image.DecompressionBombError) as error:
         raise BadImage(f"{name}: the picture cannot be decoded ({error}); save it again") from error
 
 
-def share_of(n_pictures: int, notes: Notes) -> int:
-    """Texels that each of a mesh's so many pictures may have. Raises LimitExceeded."""
-    if n_pictures > MAX_PICTURES:
-        raise LimitExceeded(
-            f"{notes.path}: {n_pictures:,} pictures, at most {MAX_PICTURES:,} are read; join them"
-        )
-    return max(MAX_TEXELS // max(n_pictures, 1), LEAST_SHARE)
+class Pictures:
+    """The pictures of a mesh, each read once, within what all of them may take together."""
+
+    def __init__(self, count: int, notes: Notes):
+        """Raises LimitExceeded for more than MAX_PICTURES."""
+        if count > MAX_PICTURES:
+            raise LimitExceeded(
+                f"{notes.path}: {count:,} pictures, at most {MAX_PICTURES:,} are read; join them"
+            )
+        self.notes, self.share = notes, max(MAX_TEXELS // max(count, 1), LEAST_SHARE)
+        self.pixels: dict[Hashable, np.ndarray | None] = {}
+
+    def get(
+        self, key: Hashable, content: Callable[[], tuple[bytes, str]], subject: str | None = None
+    ) -> np.ndarray | None:
+        """The picture in the bytes that `content` gives with their name, as `read_picture` reads it; None and
+        a note where it cannot be read."""
+        if key not in self.pixels:
+            try:
+                self.pixels[key] = read_picture(*content(), self.share, self.notes)
+            except FormatError as error:
+                self.pixels[key] = None
+                self.notes.add(f"has a texture that is not shown: {error}", subject)
+        return self.pixels[key]
 
 
 def _identified(data: bytes, name: str):
@@ -63,11 +82,8 @@ def _identified(data: bytes, name: str):
         if kind not in Image.OPEN:
             continue
         factory, accept = Image.OPEN[kind]
-        if kind == "TGA":
-            known = name.lower().endswith(".tga")
-        else:
-            known = accept is not None and accept(data[:16])
-        if known is True or isinstance(known, int | bool) and known:
+        known = name.lower().endswith(".tga") if kind == "TGA" else accept and accept(data[:16])
+        if known and not isinstance(known, str):  # a text is Pillow's reason against
             return factory(io.BytesIO(data), name)
     beginning = printable(data[:12].decode("latin-1"))
     raise BadImage(
@@ -107,30 +123,10 @@ def _reduced(image, factor: int) -> np.ndarray:
     rows = max(1, STRIP // max(width, 1) // factor) * factor
     for top in range(0, height, rows):
         strip = image.crop((0, top, width, min(top + rows, height)))
-        strip = _eight_bits(strip).convert("RGBA")
+        strip = eight_bits(strip).convert("RGBA")
         done = np.asarray(strip.reduce(factor) if factor > 1 else strip)
         out[top // factor : top // factor + len(done)] = done
     return out
-
-
-def _eight_bits(image):
-    """Grey levels of 16 bits and more scaled to 8, which Pillow would clip."""
-    from PIL import Image
-
-    if not image.mode.startswith(("I", "F")):
-        return image
-    levels = np.asarray(image).astype(np.float64)
-    scale = 255 / 65535 if image.mode.startswith("I") else 255
-    return Image.fromarray(np.clip(np.rint(levels * scale), 0, 255).astype(np.uint8))
-
-
-def _reduced_array(pixels: np.ndarray, name: str, share: int, notes: Notes) -> np.ndarray:
-    from PIL import Image
-
-    factor = _factor(pixels.shape[1::-1], share)
-    if factor > 1:
-        notes.add(f"the picture {name} is made {factor} times smaller on reading")
-    return _reduced(Image.fromarray(pixels), factor)
 
 
 def _ktx2(data: bytes, name: str) -> np.ndarray:

@@ -1,8 +1,12 @@
 """Polygons as triangles."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
+
+from formats.surfaces.lines import within
+from formats.surfaces.surface import check_budget, check_indices
 
 MAX_CORNERS = 1000
 MAX_LOOKS = 300_000
@@ -10,17 +14,20 @@ MAX_LOOKS = 300_000
 
 
 def triangulated(
-    counts: np.ndarray, corners: np.ndarray, positions: np.ndarray
+    path: Path | str, counts: np.ndarray, corners: np.ndarray, positions: np.ndarray, n_bytes: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """(F, 3) places in `corners`, and (F,) which polygon each triangle is of.
 
     `counts` (P,) corners of each polygon in turn, `corners` (sum of them,) vertices, `positions` (V, 3).
     Convex polygons become fans; of those that are not, ears are cut. Fewer than three corners give nothing.
+    Raises BadMesh, and LimitExceeded for more triangles than a file of so many bytes may have.
     """
-    starts = np.cumsum(counts) - counts
     n = np.maximum(counts - 2, 0)
+    check_budget(path, int(n.sum()), n_bytes)
+    check_indices(path, corners, len(positions))
+    starts = np.cumsum(counts) - counts
     polygon = np.repeat(np.arange(len(counts)), n)
-    step = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+    step = within(n)
     first = starts[polygon]
     fans = np.stack([first, first + step + 1, first + step + 2], 1)
     if (counts <= 3).all():

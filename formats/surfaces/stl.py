@@ -9,7 +9,6 @@ from formats.errors import BadMesh
 from formats.safe_input import read_input
 from formats.surfaces.surface import Notes, Surface, check_budget, sound_colours
 
-MAX_FILE = 2**31
 HEADER = 84
 RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
 VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
@@ -20,7 +19,7 @@ FLAG = 0x8000
 
 def read_stl(path: Path | str, notes: Notes) -> list[Surface]:
     """All triangles. Raises BadMesh, LimitExceeded, MissingFile."""
-    data = read_input(path, MAX_FILE)
+    data = read_input(path)
     count, colours = int.from_bytes(data[80:84], "little"), None
     if count == 0 and len(data) > HEADER and (len(data) - HEADER) % RECORD.itemsize == 0:
         count = (len(data) - HEADER) // RECORD.itemsize

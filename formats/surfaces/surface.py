@@ -1,12 +1,11 @@
 """What every reader of meshes gives: surfaces with the paint that colours them, and notes."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from formats.errors import BadMesh, LimitExceeded, printable
+from formats.errors import BadMesh, LimitExceeded, listed, printable
 
 MAX_TRIANGLES = 30_000_000
 """Of all surfaces together, as placed."""
@@ -14,7 +13,6 @@ FREE_TRIANGLES = 500_000
 TRIANGLES_PER_BYTE = 2
 """Small files may place at most FREE_TRIANGLES, larger ones so many per byte: instances cost no bytes."""
 MAX_NOTES = 50
-NAMED = 4
 
 
 class Notes:
@@ -36,13 +34,6 @@ class Notes:
             about = f"{listed(subjects)}: " if subjects else ""
             sentences.append(printable(f"{self.path}: {about}{sentence}"))
         return tuple(sentences)
-
-
-def listed(names: Iterable[str]) -> str:
-    """ "a, b and 3 more"."""
-    names = list(dict.fromkeys(str(name)[:80] for name in names))
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from formats.capture_frame import sphere
 from formats.surfaces.surface import Paint, Surface, Texture
 from formats.views import View
 
@@ -24,7 +25,6 @@ ON_BORDER = 1e-3
 """Of a texel: coordinates so near to a border do not reach beyond it."""
 PROBES = 32
 PROBE_SIDE = 32
-GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,12 +76,9 @@ def seen_from_behind(mesh: Mesh) -> bool:
         return False
     points, faces = mesh.triangles
     single = np.array([surface.single_sided for surface in mesh.surfaces])
-    step = np.arange(PROBES)
-    z, turn = 1 - (2 * step + 1) / PROBES, GOLDEN_ANGLE * step
-    ring = np.sqrt(1 - z * z)
     grid = (np.arange(PROBE_SIDE) + 0.5) * 2 / PROBE_SIDE - 1
     across, along = (axis.ravel()[:, None] for axis in np.meshgrid(grid, grid))
-    for outward in np.stack([ring * np.cos(turn), ring * np.sin(turn), z], 1):
+    for outward in sphere(PROBES):
         right = np.cross(outward, [0, 0, 1] if abs(outward[2]) < 0.9 else [1, 0, 0])
         right /= np.linalg.norm(right)
         eyes = (2 * outward + across * right + along * np.cross(right, outward)).astype(np.float32)

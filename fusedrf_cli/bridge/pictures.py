@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from formats.captures import load_ignored, load_images
+from formats.photos import load_ignored, load_images
 from formats.views import View
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.camera_set import read_camera_set
-from formats.captures import read_cameras
+from formats.cameras import read_cameras
 from formats.closed_meshes import Hull
 from formats.errors import BadMask
 from formats.images import read_mask

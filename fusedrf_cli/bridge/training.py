@@ -8,11 +8,10 @@ import numpy as np
 import torch
 
 from formats.atomic import check_space
-from formats.captures import hold_out, is_mesh, load_photos
-from formats.meshes import mesh_capture
-from formats.photos import loading_bytes
+from formats.meshes import is_mesh, mesh_capture
+from formats.photos import load_photos, loading_bytes
 from formats.scene import SceneGraph
-from formats.views import Capture, check_parallax
+from formats.views import Capture, check_parallax, hold_out
 from fusedrf_cli.bridge.capture_cameras import cameras_of_capture
 from fusedrf_cli.bridge.depth_supervision import known_points
 from fusedrf_cli.bridge.holdout_evaluation import measure, warn_of_holdout

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from formats.camera_set import FARTHEST, CameraSet
-from formats.captures import read_cameras
+from formats.cameras import read_cameras
 from formats.views import NO_DISTORTION, View
 from fusedrf_cli.bridge.capture_cameras import camera_set_of, chosen_camera_set, view_box_in_frame
 from fusedrf_cli.bridge.pictures import camera_of

@@ -19,7 +19,6 @@ from formats.bundle import (
     Bundle,
     BundleWriter,
     OpenBundle,
-    field_member,
     is_bundle,
     member_name,
     read_bundle,
@@ -175,6 +174,12 @@ def test_refused_before_anything_is_written(tmp_path):
     with pytest.raises(errors.OutputExists):
         writer.write(path, scene)
     assert path.read_bytes() == b"precious"
+
+
+def field_member(record):
+    """The member name and bytes of one field."""
+    data = encode_field(record)
+    return member_name(data), data
 
 
 NAME, FIELD = field_member(LAMP)

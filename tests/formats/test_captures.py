@@ -8,15 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from formats.captures import (
-    View,
-    hold_out,
-    is_capture,
-    load_images,
-    read_cameras,
-    read_capture,
-    write_capture,
-)
+from formats.cameras import read_cameras
+from formats.captures import is_capture, read_capture, write_capture
 from formats.errors import (
     BadImage,
     BadIntrinsics,
@@ -32,6 +25,8 @@ from formats.errors import (
     UnsupportedCamera,
 )
 from formats.images import write_png
+from formats.photos import load_images
+from formats.views import View, hold_out
 
 # A camera at (4, 1, 2) that looks along world -x with z up: its right is world +y, its back world +x.
 POSE = [[0, 0, 1, 4], [1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 0, 1]]

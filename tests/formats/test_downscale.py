@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from formats.captures import load_ignored, load_images, read_capture
+from formats.captures import read_capture
 from formats.errors import BadIntrinsics
 from formats.images import read_image, write_png
-from formats.photos import LONGEST, pictures
+from formats.photos import LONGEST, load_ignored, load_images, pictures
 from tests.formats.test_captures import PIXEL, POINT, frame, photo, project, real, write
 from tests.formats.test_readers import NAMES, binary_model, llff, llff_rows, photos, polycam, turned_photo
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from formats.cameras import JSON_TOKEN, read_document
-from formats.captures import read_cameras, read_capture
+from formats.cameras import JSON_TOKEN, read_cameras, read_document
+from formats.captures import read_capture
 from formats.colmap import read_model
 from formats.colmap_points import binary_points
 from formats.errors import (

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from formats.captures import load_ignored, read_capture
+from formats.captures import read_capture
 from formats.errors import BadMask
 from formats.images import read_mask
+from formats.photos import load_ignored
 from tests.formats.test_captures import frame, photo, write
 from tests.formats.test_readers import binary_model, llff, photos
 

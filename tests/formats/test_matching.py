@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from formats.captures import load_photos, read_capture
-from formats.errors import BadSchema, MissingFile, NoViews
+from formats.captures import read_capture
+from formats.errors import BadSchema, NoViews
 from formats.matching import match_photos
+from formats.photos import load_photos
 from formats.posing import photos_to_pose
 from tests.formats.test_readers import BIG, binary_model, llff_rows, ring
 
@@ -256,7 +257,7 @@ def test_names_of_a_model(tmp_path, change, place):
     for i, name in enumerate(names):
         grey(tmp_path / place / name, i)
     if place == "shoot" and {"rgb", "scan"} & set(change("").replace("\\", "/").split("/")):
-        with pytest.raises(MissingFile, match="shoot/p0.png"):  # two folders that contradict each other
+        with pytest.raises(NoViews, match="shoot/p0.png"):  # two folders that contradict each other
             read_capture(tmp_path)
         return
     read = read_capture(tmp_path)
@@ -269,9 +270,7 @@ def test_photos_under_other_names_are_not_matched_by_order(tmp_path):
     for i, name in enumerate(RIG):
         side, number = name.split("/")
         grey(tmp_path / f"images/{number[:-4]}_{side}.png", i)
-    with pytest.raises(
-        MissingFile, match=r"6 photos such as left/0\.png.*6 others, such as images/0_left\.png"
-    ):
+    with pytest.raises(NoViews, match=r"6 photos such as left/0\.png.*6 others, such as images/0_left\.png"):
         read_capture(tmp_path)
 
 

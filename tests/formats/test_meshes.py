@@ -10,9 +10,10 @@ import pytest
 import trimesh
 from PIL import Image
 
-from formats.captures import is_capture, load_images, read_capture
+from formats.captures import is_capture, read_capture
 from formats.errors import BadMesh, MissingFile
 from formats.meshes import is_mesh, mesh_capture
+from formats.photos import load_images
 
 RED, BLUE, GREEN = [200, 30, 60], [10, 90, 220], [40, 180, 70]
 FEW = {"n_train": 8, "size": 64, "samples_per_pixel": 4}

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from formats.errors import MissingFile, NotACapture
+from formats.errors import NotACapture, NoViews
 from formats.overview import overview
 from tests.formats.test_captures import frame, photo, write
 from tests.formats.test_masks import keep
@@ -125,7 +125,7 @@ def test_the_largest_model_is_of_other_photos(tmp_path):
     photos(tmp_path / "images", ("a.png", "b.png"))
     binary_model(tmp_path / "sparse/0", ("a.png", "b.png"))
     binary_model(tmp_path / "sparse/1", ("x.png", "y.png", "z.png"))
-    with pytest.raises(MissingFile, match=r"sparse/1: names 3 photos.*give the folder .*sparse/0 to read"):
+    with pytest.raises(NoViews, match=r"sparse/1: names 3 photos.*give the folder .*sparse/0 to read"):
         overview(tmp_path)
 
 

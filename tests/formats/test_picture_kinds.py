@@ -5,9 +5,10 @@ import pytest
 from PIL import Image
 
 import formats.images
-from formats.captures import load_photos, read_capture
+from formats.captures import read_capture
 from formats.errors import BadImage
 from formats.images import FORMATS, as_stored, decoded_at_once, oriented, read_image
+from formats.photos import load_photos
 from tests.formats.test_captures import frame, write
 
 QUARTERS = np.array([[200, 30, 30], [30, 180, 40], [40, 60, 210], [128, 128, 128]])

@@ -12,7 +12,7 @@ from PIL import Image as Pillow
 from PIL import ImageOps
 
 from formats import colmap
-from formats.captures import is_capture, load_ignored, load_images, load_photos, read_capture
+from formats.captures import is_capture, read_capture
 from formats.errors import (
     BadIntrinsics,
     BadMask,
@@ -26,6 +26,7 @@ from formats.errors import (
     NoViews,
     UnsupportedCamera,
 )
+from formats.photos import load_ignored, load_images, load_photos
 from formats.points import read_ply_points
 from formats.views import check_parallax
 from tests.formats.test_captures import PIXEL, POINT, POSE, SIZE, frame, photo, posed, project, real, write
@@ -201,7 +202,7 @@ def test_colmap_without_the_full_size_photos(tmp_path):
     LLFF's own poses are there, which go by their order."""
     binary_model(tmp_path / "sparse/0", ("IMG_9.JPG", "IMG_10.JPG"))
     photos(tmp_path / "images_2", ("image000.png", "image001.png"), (50, 40))
-    with pytest.raises(MissingFile, match=r"photos such as IMG_9\.JPG.* 2 others, such as images_2/image000"):
+    with pytest.raises(NoViews, match=r"photos such as IMG_9\.JPG.* 2 others, such as images_2/image000"):
         read_capture(tmp_path)
     np.save(tmp_path / "poses_bounds.npy", llff_rows(2))
     capture = read_capture(tmp_path)
@@ -210,7 +211,7 @@ def test_colmap_without_the_full_size_photos(tmp_path):
 
 def test_colmap_photos_that_are_missing(tmp_path):
     binary_model(tmp_path / "sparse/0")
-    with pytest.raises(MissingFile, match=r"3 photos such as 10\.png"):
+    with pytest.raises(NoViews, match=r"3 photos such as 10\.png"):
         read_capture(tmp_path)
     photos(tmp_path / "images", NAMES[:2])
     capture = read_capture(tmp_path)
@@ -554,6 +555,19 @@ def test_points_of_a_ply(tmp_path, coding, colour):
     points = read_ply_points(tmp_path / "p.ply")
     assert points.positions.tolist() == [list(p) for p in POINTS.values()]
     assert points.colours.tolist() == [[127, 255, 0]] * 3
+
+
+def test_points_beside_other_elements(tmp_path):
+    """Faces may come first, vertices may hold lists, and colours may have 16 bits."""
+    header = "ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int vertex_indices\n"
+    header += "element vertex 2\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "property list uchar float weights\n"
+    header += "".join(f"property ushort {hue}\n" for hue in ("red", "green", "blue"))
+    rows = "3 0 1 0\n1 2 3 2 0.5 0.5 65535 0 257\n4 5 6 0 0 65535 0\n"
+    (tmp_path / "p.ply").write_text(header + "end_header\n" + rows)
+    points = read_ply_points(tmp_path / "p.ply")
+    assert points.positions.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert points.colours.tolist() == [[255, 0, 1], [0, 255, 0]]
 
 
 BAD_CLOUDS = {

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from formats.captures import load_ignored, load_photos, read_capture
+from formats.captures import read_capture
+from formats.photos import load_ignored, load_photos
 from formats.views import View
 from tests.formats.test_captures import looking_at
 

@@ -23,10 +23,11 @@ from pathlib import Path
 import numpy as np
 
 from formats.bundle import is_bundle
-from formats.captures import load_photos, read_capture
+from formats.captures import read_capture
 from formats.checkpoints import read_checkpoint
 from formats.errors import FormatError
 from formats.meshes import is_mesh, mesh_capture
+from formats.photos import load_photos
 from fusedrf_cli.errors import FusedRFError
 from fusedrf_cli.main import cli
 from tests.bridge.conftest import stock_fields
