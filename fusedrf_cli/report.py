@@ -58,8 +58,8 @@ def _lines(facts: dict, indent: str) -> Iterator[str]:
 def _phrase(key: str, value: object) -> str:
     """One value on one line, with the unit that follows from its `key`."""
     if isinstance(value, dict):
-        parts = ((name.replace("_", " "), _phrase(f"{key} {name}", part)) for name, part in value.items())
-        return ", ".join(f"{name} {phrase}" for name, phrase in parts)
+        told = ((name, part) for name, part in value.items() if part is not None)
+        return ", ".join(f"{name.replace('_', ' ')} {_phrase(f'{key} {name}', part)}" for name, part in told)
     if isinstance(value, list):
         shown = value if len(value) <= _LONGEST_LIST else value[:_LONGEST_LIST]
         rest = f" and {len(value) - len(shown)} more" if len(shown) < len(value) else ""

@@ -59,6 +59,7 @@ def fuse(
 ) -> dict:
     """Turn a composed scene into a bundle of it, of one field or of a field for each source, with the scene's
     history; `somewhere` writes, as `written_somewhere` does."""
+    started = time.monotonic()
     with engine(request.device, request.threads, progress) as device:
         progress.phase("reading", None)
         check_checkpoint(request.output, request.resume, request.overwrite)
@@ -71,7 +72,6 @@ def fuse(
         refuse_options(kind, request)
         if kind.field is None:
             note_options(request, loaded, progress)
-        started = time.monotonic()
         bundle = FusedBundle(request, everything, scene, kind.field is not None)
         warn_of_hidden(bundle.hidden, progress)
         cameras = result_cameras(loaded, progress)
