@@ -105,6 +105,13 @@ time_budget = click.option(
     metavar="S",
     help="Stop learning after S seconds, all tries together.",
 )
+fused_time_budget = click.option(
+    "--time-budget",
+    type=PositiveType(),
+    metavar="S",
+    help="Stop learning after S seconds, all tries together; what comes before, such as sampling the scene "
+    "for dense and sparse, is not counted.",
+)
 max_size = click.option("--max-size", type=BytesType(), help="Largest output file, such as 25MB.")
 fused_max_size = click.option(
     "--max-size",

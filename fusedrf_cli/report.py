@@ -40,7 +40,7 @@ def lines(report: dict) -> Iterator[str]:
 def _lines(facts: dict, indent: str) -> Iterator[str]:
     for key, value in facts.items():
         label = f"{indent}{key.replace('_', ' ')}"
-        if value is None or value == [] or value == {}:
+        if value in (None, "", [], {}):
             continue
         if _is_table(value):
             yield f"{label}:"

@@ -251,7 +251,8 @@ class _Loader:
             if leaf.field is not None:
                 fields.append((leaf, bundle, leaf.field))
             elif leaf.source is not None:
-                fields += self.sources(leaf, resolve_source(self.path, leaf.source, allow_outside))
+                target = resolve_source(self.path, leaf.source, allow_outside, leaf.name)
+                fields += self.sources(leaf, target)
         if not fields and leaves:
             raise InvalidInput(f'{self.path}: nothing of the scene is visible; remove a "visible": false')
         if not fields:

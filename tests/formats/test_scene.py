@@ -244,6 +244,23 @@ def test_refused(data, error):
     assert type(caught.value) is error and str(caught.value).isprintable()
 
 
+@pytest.mark.parametrize(
+    "content, says",
+    [
+        (
+            node(nodes=[]),
+            "node 'n' has the word 'nodes', expected some of name, field, source, .*, children$",
+        ),
+        (node(children=[{"name": "c", "sorce": "a"}]), "node 'c' has the word 'sorce', expected some of"),
+        (node(scale=[1, 1, 0]), r"node 'n': scale \[1.0, 1.0, 0.0\] is not three numbers, none of them 0$"),
+        (node(name="é" * 200), "node name 'é+…' has 400 bytes; give one of at most 255$"),
+    ],
+)
+def test_a_sentence_says_what_was_expected(content, says):
+    with pytest.raises(errors.FormatError, match=f"^here: {says}"):
+        parse_scene(content, "here")
+
+
 def test_limits_themselves_are_accepted_at_once():
     began = time.process_time()
     assert len(parse_scene(nested(MAX_DEPTH), "here").nodes) == 1
@@ -393,8 +410,10 @@ def test_sources_inside(folder, source):
 
 def test_sources_that_are_not_there(folder):
     for source in ("absent", "a" * 3000):
-        with pytest.raises(errors.MissingFile):
-            resolve_source(folder / "scene.json", source)
+        with pytest.raises(errors.MissingFile, match="node 'n': source 'a"):
+            resolve_source(folder / "scene.json", source, node="n")
+    with pytest.raises(errors.MissingFile, match=f"; put it at {folder}/absent, or name another source"):
+        resolve_source(folder / "scene.json", "absent")
     for source in ("", "a\0b", "a\nb"):
         with pytest.raises(errors.BadName):
             resolve_source(folder / "scene.json", source)
