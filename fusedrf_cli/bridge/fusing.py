@@ -1,5 +1,6 @@
 """`fuse`: a scene to a bundle, of any kinds, by one search over the ways and sizes it can be made in."""
 
+import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
@@ -98,6 +99,8 @@ def fuse(
             checkpoint_path(request.output).unlink(missing_ok=True)
         reports = made.resolution_reports()
         warn_of_resolution(reports, remedy(kind, scene.composed), progress)
+        if kind.field is None and request.max_size is None:
+            warn_of_default_size(made.builder.request, progress)
         figures = made.figures()
     report = {
         "output": request.output,
@@ -352,6 +355,17 @@ def make_room(memory: Memory, builder: DistilledBuilder, scene: FuseScene, reque
         advice="give a smaller --max-size",
     )
     return together
+
+
+def warn_of_default_size(request: BuildRequest, progress) -> None:
+    """Say which size would have kept the sources as they are, where only the default one was in the way."""
+    size = request.unchanged_bytes and request.overhead + request.unchanged_bytes
+    changes = request.precision or request.ranks or request.sh_degree is not None or request.target
+    if size and size > request.limit and not changes:
+        progress.warn(
+            f"fields were made smaller to fit into {readable_size(request.limit)}, the limit where none is "
+            f"given; --max-size {math.ceil(size / 1e6)}MB would keep the sources as they are"
+        )
 
 
 def warn_of_resolution(reports: list[ResolutionReport], remedy: str, progress) -> None:
