@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,7 +17,7 @@ from fusedrf_cli.engine.rendering.metrics import PSNR_CAP, psnr
 from fusedrf_cli.engine.settings import using
 from fusedrf_cli.progress import NullProgress
 from fusedrf_cli.requests import FuseRequest
-from tests.bridge.conftest import PLACES, done, part, write_scene_of
+from tests.bridge.conftest import done, part, write_scene_of
 
 VM = ("--kind", "vm", "--no-finetune", "--max-size", "300kB")
 
@@ -87,18 +86,6 @@ def test_a_default_limit_in_the_way_is_said(report):
         coarse = report("fuse", "pair.json", "-o", "coarse.rfpack", "--precision", "int4", "--no-finetune")
     assert again["bytes"] == whole["bytes"] and not whole["warnings"] and not again["warnings"]
     assert not any("would keep" in warning for warning in coarse["warnings"])
-
-
-def test_a_report_lists_what_can_be_named_afterwards(report, folder):
-    """What groups of another rule hold, too."""
-    nodes = [make_node(n, source=f"{n}.rfpack", translation=PLACES[n]) for n in ("red", "blue")]
-    group = replace(make_node("both", children=tuple(nodes)), composition="add")
-    write_scene(folder / "group.json", SceneGraph((make_node("floor", source="floor.rfpack"), group)))
-    for kind in ("vm", "sparse"):
-        words = ("--kind", kind, "--no-finetune", "--max-size", "300kB")
-        said = report("fuse", "group.json", "-o", f"{kind}.rfpack", *words)
-        listed = [part["name"] for part in report("info", f"{kind}.rfpack")["objects"]]
-        assert [part["name"] for part in said["objects"]] == listed == ["floor", "red", "blue"]
 
 
 def test_total_seconds_count_reading(folder, monkeypatch):
