@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import time
 import unicodedata
 import warnings
@@ -242,6 +243,17 @@ def test_refused(data, error):
     with pytest.raises(error, match="^here: ") as caught:
         parse_scene(data, "here")
     assert type(caught.value) is error and str(caught.value).isprintable()
+
+
+def test_the_group_of_the_page_is_one():
+    """docs/how-fusing-works.md shows how a scene with a group is written."""
+    page = (Path(__file__).parents[2] / "docs/how-fusing-works.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```json\n(.*?)```", page, re.DOTALL)
+    scene = parse_scene(block.encode(), "the page")
+    assert [leaf.groups for leaf in scene.leaves()] == [(), *[(("fountain", "add"),)] * 2]
+    again = parse_scene(dump_scene(scene), "again")  # by the version and features that the page names
+    assert (again.nodes, again.version) == (scene.nodes, scene.version)
+    assert json.loads(dump_scene(scene))["requires"] == json.loads(block)["requires"]
 
 
 @pytest.mark.parametrize(
