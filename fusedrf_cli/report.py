@@ -37,7 +37,8 @@ def lines(report: dict) -> Iterator[str]:
     yield from _lines(facts, "")
 
 
-def _lines(facts: dict, indent: str) -> Iterator[str]:
+def _lines(facts: dict, indent: str, around: str = "") -> Iterator[str]:
+    """around: the keys that the facts stand in."""
     for key, value in facts.items():
         label = f"{indent}{key.replace('_', ' ')}"
         if value in (None, "", [], {}):
@@ -50,9 +51,9 @@ def _lines(facts: dict, indent: str) -> Iterator[str]:
             yield from (f"{indent}  {sentence}" for sentence in value)
         elif isinstance(value, dict) and any(isinstance(part, dict | list) for part in value.values()):
             yield f"{label}:"
-            yield from _lines(value, indent + "  ")
+            yield from _lines(value, indent + "  ", f"{around}{key} ")
         else:
-            yield f"{label}: {_phrase(key, value)}"
+            yield f"{label}: {_phrase(around + key, value)}"
 
 
 def _phrase(key: str, value: object) -> str:
@@ -66,10 +67,16 @@ def _phrase(key: str, value: object) -> str:
         return " ".join(_coordinate(part) or _phrase(key, part) for part in shown) + rest
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if key.split(" ")[0] == "bytes" or key.endswith("_bytes"):
+    if "bytes" in key.split(" ") or key.endswith("_bytes"):
         return readable_size(value)
     if isinstance(value, float):
-        unit = " s" if "seconds" in key else " dB" if "psnr" in key and not key.endswith("views") else ""
+        unit = (
+            " s"
+            if "seconds" in key
+            else " dB"
+            if "psnr" in key and not key.endswith(("views", "share"))
+            else ""
+        )
         return f"{value + 0.0:.4g}{unit}"  # + 0.0: no "-0"
     return str(value)
 

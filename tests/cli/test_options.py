@@ -343,6 +343,13 @@ def test_a_report_for_people_has_units(run, bridge):
         "  r_0   30.5 dB",
         "  r_10  31.5 dB",
     ]
+    bridge.report = {"psnr": {"covered": 22.5, "covered_share": 0.5, "worst": {"name": "a", "bytes": 2000}}}
+    assert run("fuse", "chair.rfpack", "-o", "out.rfpack").stdout.splitlines() == [
+        "psnr:",
+        "  covered: 22.5 dB",
+        "  covered share: 0.5",
+        "  worst: name a, bytes 2 kB",
+    ]
 
 
 def test_a_report_as_json_is_one_object_and_nothing_else(run, bridge):
