@@ -70,13 +70,8 @@ def _phrase(key: str, value: object) -> str:
     if "bytes" in key.split(" ") or key.endswith("_bytes"):
         return readable_size(value)
     if isinstance(value, float):
-        unit = (
-            " s"
-            if "seconds" in key
-            else " dB"
-            if "psnr" in key and not key.endswith(("views", "share"))
-            else ""
-        )
+        decibels = "psnr" in key and not key.endswith(("views", "share"))
+        unit = " s" if "seconds" in key else " dB" if decibels else ""
         return f"{value + 0.0:.4g}{unit}"  # + 0.0: no "-0"
     return str(value)
 
