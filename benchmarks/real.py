@@ -26,7 +26,7 @@ from formats.captures import is_capture, read_capture
 from formats.errors import FormatError
 from formats.views import Capture, View, hold_out
 from fusedrf_cli import plots
-from fusedrf_cli.bridge.pictures import WHITE, camera_of, truth_of
+from fusedrf_cli.bridge.pictures import camera_of, truth_of
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -125,7 +125,7 @@ def write_pair(field: Path, view: View, path: Path) -> None:
     """A photo, of which masks leave white what they exclude, beside the field's picture of it, as JPEG."""
     shown, origin = renderable(load_scene(str(field)))
     truth, kept = truth_of(view)
-    shot = np.clip(render_image(shown, camera_of(view), origin=origin).over(WHITE), 0, 1)
+    shot = np.clip(render_image(shown, camera_of(view), origin=origin).over(), 0, 1)
     pair = np.concatenate([np.where(kept[..., None], truth, 1), shot], 1)
     size = (2 * SHOWN_WIDTH, round(SHOWN_WIDTH * view.height / view.width))
     Image.fromarray(np.rint(255 * pair).astype(np.uint8)).resize(size, Image.Resampling.BOX).save(

@@ -26,12 +26,6 @@ class InvalidInput(FusedRFError):
     exit_code = 3
 
 
-class VersionProblem(FusedRFError):
-    """An input made by a version this one cannot read."""
-
-    exit_code = 4
-
-
 class ResourceProblem(FusedRFError):
     """Disk, memory, permission or device."""
 

@@ -31,9 +31,6 @@ from fusedrf_cli.requests import (
     ValidateRequest,
 )
 
-SHOWING = ("crop", "opacity", "tint")
-
-
 # --- compose ------------------------------------------------------------------------------------------------
 
 
@@ -64,7 +61,8 @@ def compose(request: ComposeRequest, progress) -> dict:
 def _node(entry: Input, name: str, request: ComposeRequest) -> Node:
     source = _relative(entry.path, request.output)
     resolve_source(request.output, source, request.allow_outside)
-    showing = {key: value for key in SHOWING if (value := getattr(entry, key)) is not None}
+    shown = {key: getattr(entry, key) for key in ("crop", "opacity", "tint")}
+    showing = {key: value for key, value in shown.items() if value is not None}
     showing |= {"visible": False} if entry.hidden else {}
     background = entry.background_node
     return make_node(name, source=source, background=background, showing=showing, **entry.words)

@@ -9,8 +9,6 @@ from msgspec import Meta
 from fusedrf_cli.placement import node_words
 
 STDIO = "-"
-EARLIER = {"rgb": "finetune", "naive": "reference", "direction": "view_from", "keep_history": "undoable"}
-"""Keywords that verbs still take by the names that they had in the version before."""
 Positive = Annotated[float, Meta(gt=0)]
 Count = Annotated[int, Meta(ge=1)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]

@@ -19,7 +19,7 @@ from fusedrf_cli import requests
 from fusedrf_cli.engine.settings import using
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.progress import NullProgress
-from fusedrf_cli.request_parts import EARLIER, STDIO
+from fusedrf_cli.request_parts import STDIO
 from fusedrf_cli.requests import EditRequest, Writing
 
 __all__ = [
@@ -33,11 +33,13 @@ def verb(name: str, request: type, does: str = "", module: str = "bridge") -> Ca
     """The verb of a name, which hands a request to a function of a module of this package, by default of that
     name."""
     signature = inspect.signature(request)
+    # keywords that are still taken by the names that they had in the version before
+    earlier = {"rgb": "finetune", "naive": "reference", "direction": "view_from", "keep_history": "undoable"}
 
     def run(
         *words: Any, progress: NullProgress | None = None, settings: Sequence = (), **options: Any
     ) -> dict:
-        options = {EARLIER.get(name, name): value for name, value in options.items()}
+        options = {earlier.get(name, name): value for name, value in options.items()}
         checked_request = checked(request, signature.bind(*words, **options).arguments)
         progress = progress or NullProgress()
         held = (

@@ -29,7 +29,6 @@ class BackgroundConfig:
     """Entries of two rotations that count as one."""
 
 
-PRECISIONS = ("float16", "int8", "int4")  # the dearest first
 LEARNT = "fused"  # the node of what was learnt
 
 
@@ -95,7 +94,8 @@ def storage_options(
     if request.precision is None and own is not None:
         yield field, None, own
     trimmed = registry.kind(field.kind).trimmed(opened(field).to("cpu"))
-    for precision in (request.precision,) if request.precision else PRECISIONS:
+    dearest_first = "float16", "int8", "int4"
+    for precision in (request.precision,) if request.precision else dearest_first:
         yield trimmed, precision, request.sizes.exactly(trimmed, precision)
 
 

@@ -18,7 +18,6 @@ from fusedrf_cli.bridge.evaluation_views import evaluation_views_of
 from fusedrf_cli.bridge.field_cache import FieldCache
 from fusedrf_cli.bridge.fusing import fuse, source_bytes
 from fusedrf_cli.bridge.memory import Memory, measured, sources
-from fusedrf_cli.bridge.pictures import WHITE
 from fusedrf_cli.bridge.rendering import composite_of, frame_memory, renderable
 from fusedrf_cli.bridge.runtime import checkpoint_path, engine
 from fusedrf_cli.bridge.scene import load_scene, unusable_kind
@@ -57,10 +56,6 @@ class ChartConfig:
     """How many times longer a group waits that is behind others."""
 
 
-COSTS = ("seconds", "bytes", "ms")
-NOTHING_TRIED = "no way to fuse was left to try; ask for other --kinds, or give more --budget"
-
-
 @dataclass
 class Point:
     """One way to fuse the scene, and what it gave."""
@@ -78,7 +73,7 @@ class Point:
     ms: float = float("nan")
     """Median time of a frame."""
     frontier: list[str] = field(default_factory=list)
-    """The COSTS at which no other point is as good for less."""
+    """The costs (plots.AXES) at which no other point is as good for less."""
     warnings: list[str] = field(default_factory=list)
 
 
@@ -130,7 +125,7 @@ class Benchmark:
         needed["the pictures to compare with"] = len(cameras) * size[0] * size[1] * chart.per_pixel_kept
         memory.expect(needed, advice="give a smaller --size")
         shots = [render_image(composed, c, origin=composed.origin) for c in cameras]
-        truth, seen = [shot.over(WHITE) for shot in shots], [shot.opacity > config.covered for shot in shots]
+        truth, seen = [shot.over() for shot in shots], [shot.opacity > config.covered for shot in shots]
         total = source_bytes(loaded)
         return cls(scene, memory, size, allow_outside, device, box, cameras, truth, seen, total)
 
@@ -142,7 +137,7 @@ class Benchmark:
     def quality(self, bundle: Path) -> dict[str, float]:
         """Mean `psnr` and `ssim` of a fused bundle, and `covered`, the PSNR of the pixels that are."""
         render, origin = renderable(load_scene(str(bundle), budget=self.memory, device=self.device))
-        shots = [render_image(render, c, origin=origin).over(WHITE) for c in self.cameras]
+        shots = [render_image(render, c, origin=origin).over() for c in self.cameras]
         pairs = list(zip(shots, self.truth, strict=True))
         inside = [psnr(a[m], b[m]) for (a, b), m in zip(pairs, self.covered, strict=True) if m.any()]
         measures = {"psnr": [psnr(*p) for p in pairs], "ssim": [ssim(*p) for p in pairs], "covered": inside}
@@ -330,7 +325,8 @@ class Charting:
             spent[group] += time.monotonic() - started - now
             runs = {g: members for g, members in runs.items() if g[0] not in self.refused}
         if not self.points:
-            raise next(iter(self.refused.values()), UsageProblem(NOTHING_TRIED))
+            nothing = "no way to fuse was left to try; ask for other --kinds, or give more --budget"
+            raise next(iter(self.refused.values()), UsageProblem(nothing))
         return sum(map(len, runs.values()))
 
     def lags(self, runs: list[SweepRun]) -> bool:
@@ -377,10 +373,10 @@ class Charting:
 
 
 def mark_frontiers(points: list[Point]) -> None:
-    """Note at every point for which COSTS no other one is at least as good for less. Times that differ by
-    less than `noise` are taken as equal.
+    """Note at every point for which costs (plots.AXES) no other one is at least as good for less. Times that
+    differ by less than `noise` are taken as equal.
     """
-    for cost in COSTS:
+    for cost in plots.AXES:
         margin, least = 1 if cost == "bytes" else 1 + current(ChartConfig).noise, np.inf
         for point in sorted(points, key=lambda p: (-p.psnr, getattr(p, cost), p.seconds)):
             if getattr(point, cost) * margin < least:

@@ -5,7 +5,7 @@ import numpy as np
 from formats.views import Capture, View
 from fusedrf_cli.bridge.scene_bounds import SceneBounds
 from fusedrf_cli.engine.distillation.depth_points import KnownPoints
-from fusedrf_cli.engine.kernels.loops import DEPTH_TOLERANCE
+from fusedrf_cli.engine.kernels.learning import DEPTH_TOLERANCE
 
 
 def known_points(capture: Capture, bounds: SceneBounds) -> KnownPoints | None:

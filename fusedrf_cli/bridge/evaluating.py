@@ -8,7 +8,7 @@ import numpy as np
 from formats.captures import is_capture, read_capture
 from fusedrf_cli.bridge.evaluation_views import evaluation_views_of
 from fusedrf_cli.bridge.memory import Memory, measured, sources
-from fusedrf_cli.bridge.pictures import WHITE, camera_of, likeness, truth_of
+from fusedrf_cli.bridge.pictures import camera_of, likeness, truth_of
 from fusedrf_cli.bridge.rendering import composite_of, frame_memory, renderable, warn_of_work
 from fusedrf_cli.bridge.runtime import engine
 from fusedrf_cli.bridge.scene import load_scene
@@ -60,7 +60,7 @@ def evaluate(request: EvaluateRequest, progress) -> dict:
                         f"SSIM compares windows of {SSIM_WINDOW} pixels a side, and the pictures are "
                         f"{side[0]}x{side[1]}: it is left out"
                     )
-            shot = render_image(field, camera, origin=origin).over(WHITE)
+            shot = render_image(field, camera, origin=origin).over()
             views.append({"name": camera.name, **pair.likeness(shot)})
             progress.advance(i + 1, psnr=views[-1]["psnr"])
     return {
@@ -150,4 +150,4 @@ def scene_pairs(
     for look in views:
         shot = render_image(field, look.camera, origin=field.origin)
         every = np.ones(shot.opacity.shape, bool)
-        yield Pair(look.camera, shot.over(WHITE), every, shot.opacity > config.covered, look.of), len(views)
+        yield Pair(look.camera, shot.over(), every, shot.opacity > config.covered, look.of), len(views)

@@ -7,7 +7,7 @@ import torch
 
 from formats.capture_frame import scene_frame
 from formats.views import Capture, View
-from fusedrf_cli.bridge.pictures import WHITE, camera_of, likeness, over_white, truth_of
+from fusedrf_cli.bridge.pictures import camera_of, likeness, over_white, truth_of
 from fusedrf_cli.engine.distillation.ray_dataset import Pictures
 from fusedrf_cli.engine.rendering.metrics import colour_corrected, psnr
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -32,7 +32,7 @@ def measure(field, capture: Capture, pictures: Pictures, origin: np.ndarray, tra
         truth, mask = truth_of(view)
         if not mask.any():
             continue
-        shot = render_image(field, camera_of(view), origin=origin).over(WHITE)
+        shot = render_image(field, camera_of(view), origin=origin).over()
         corrected = colour_corrected(shot[mask], truth[mask])
         copy = nearest_photo(view, capture, pictures)
         rows.append(

@@ -7,8 +7,6 @@ from formats.views import View
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 
-WHITE = (1.0, 1.0, 1.0)
-
 
 def camera_of(view: View) -> Camera:
     """A capture's view as the engine's camera."""

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from formats.views import Capture
-from fusedrf_cli.bridge.pictures import WHITE, camera_of, truth_of
+from fusedrf_cli.bridge.pictures import camera_of, truth_of
 from fusedrf_cli.bridge.scene_bounds import SceneBounds
 from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.poses import (
@@ -70,7 +70,7 @@ def aligned(field, capture: Capture, bounds: SceneBounds, near: float, seed: int
         if there:
             best_camera = align(field, camera, truth, mask & half, near, seed)
             judged = mask & ~half
-            row = [render_image(field, c).over(WHITE) for c in (best_camera, camera)]
+            row = [render_image(field, c).over() for c in (best_camera, camera)]
             rows.append([psnr(shot[judged], truth[judged]) for shot in row])
     if not rows:
         return None

@@ -36,10 +36,6 @@ class PreviewConfig:
     """And its colour differs by so much."""
 
 
-PREVIEW = re.compile(r".*_(object|marked|rest)\.png")
-"""Names of previews."""
-MARKED = np.array([1.0, 0.2, 0.1])
-
 Shown = tuple[RadianceField, np.ndarray]
 """A field, and where its frame lies in the world: a position (3,), or a placement (4, 4)."""
 
@@ -50,7 +46,7 @@ def check_preview(request: ExtractRequest) -> None:
     check_writable(request.preview, request.overwrite, folders=True)
     folder = Path(request.preview)
     files = folder.iterdir() if folder.is_dir() else ()
-    others = [file for file in files if not PREVIEW.fullmatch(file.name)]
+    others = [file for file in files if not re.fullmatch(r".*_(object|marked|rest)\.png", file.name)]
     if others:
         raise OutputExists(
             f"{folder}: holds {others[0].name}, which is no preview; choose a folder that is new or empty"
@@ -113,10 +109,10 @@ def pictures_of(shown: dict[str, Shown | None], camera: Camera) -> dict[str, np.
         return render_image(field, camera, origin=origin)
 
     whole, by_itself = shot("whole"), shot("object")
-    marked, own = whole.over((1, 1, 1)), by_itself.over((1, 1, 1))
+    marked, own = whole.over(), by_itself.over()
     hidden = (by_itself.depth > whole.depth * config.before) & (np.abs(marked - own).mean(-1) > config.alike)
     before = (by_itself.opacity > 0.5) & ~hidden
-    marked[before] = 0.5 * marked[before] + 0.5 * MARKED
+    marked[before] = 0.5 * marked[before] + 0.5 * np.array([1.0, 0.2, 0.1])
     pictures = {"object": to_pixels(by_itself, None), "marked": np.rint(255 * marked).astype(np.uint8)}
     if shown["rest"] is not None:
         pictures["rest"] = to_pixels(shot("rest"), (1.0, 1.0, 1.0))

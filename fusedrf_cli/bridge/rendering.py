@@ -5,7 +5,6 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -25,8 +24,6 @@ from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, ren
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import RenderRequest
-
-NOTHING_ELSE: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -134,7 +131,7 @@ def reference(loaded: LoadedScene) -> tuple[RadianceField, np.ndarray]:
 
 
 def renderable(
-    loaded: LoadedScene, budget: Memory | None = None, needed: Mapping[str, float] = NOTHING_ELSE
+    loaded: LoadedScene, budget: Memory | None = None, needed: Mapping[str, float] | None = None
 ) -> tuple[RadianceField, np.ndarray]:
     """The same of what is marched; see `composite_of`."""
     if (lone := loaded.lone()) is not None:
@@ -144,12 +141,12 @@ def renderable(
 
 
 def composite_of(
-    loaded: LoadedScene, budget: Memory | None = None, needed: Mapping[str, float] = NOTHING_ELSE
+    loaded: LoadedScene, budget: Memory | None = None, needed: Mapping[str, float] | None = None
 ) -> ComposedField:
     """A scene as a Composite, whose fields are all in memory, where compiled loops compute all of them and
     the budget has room for them beside what is needed; else its naive composition."""
     composed = loaded.composed()
-    if budget is not None and budget.room(sources(loaded.resident) | needed) < 0:
+    if budget is not None and budget.room(sources(loaded.resident) | (needed or {})) < 0:
         return composed
     loaded.field_cache.resize(sum(loaded.sizes))
     return as_composite(composed)

@@ -2,11 +2,10 @@
 
 import os
 import sys
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -463,17 +462,13 @@ def write_field(
     overwrite: bool,
     origin: np.ndarray | None = None,
     about: SceneGraph = SceneGraph(()),
-    kept_sources: Mapping[str, OpenBundle] = MappingProxyType({}),
 ) -> int:
-    """Write one field, and kept sources (members and the bundles they are in) byte for byte, as a bundle; its
-    node is placed at `origin`: a position (3,), or a placement (4, 4). Of a field that holds several objects
-    each becomes a node. Returns the bytes written. History, framing and cameras are those of `about`.
-    """
+    """Write one field as a bundle; its node is placed at `origin`: a position (3,), or a placement (4, 4). Of
+    a field that holds several objects each becomes a node. Returns the bytes written. History, framing and
+    cameras are those of `about`."""
     writer = BundleWriter()
     member = writer.add_field(FieldRecord(field.kind, *field.state()), precision)
     graph = writer.unfolded(graph_of(member, name, origin, about))
-    for kept_member, bundle in kept_sources.items():
-        writer.copy_field(bundle, kept_member)
     writer.write(output, graph, overwrite=overwrite)
     return Path(output).stat().st_size
 

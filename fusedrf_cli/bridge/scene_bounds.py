@@ -23,10 +23,6 @@ from fusedrf_cli.engine.spaces.unbounded import WHOLE
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import TrainRequest
 
-CORE = {"inward": 0.6, "forward-facing": 0.6, "outward": 1.2}
-"""Half the side of the core: in distances between cameras and focus, or, of cameras that look outwards, in
-distances of the farthest camera from their middle."""
-
 
 @dataclass(frozen=True)
 class SceneBoundsConfig:
@@ -164,7 +160,10 @@ def _unbounded(request: TrainRequest, capture: Capture) -> SceneBounds:
 def core(frame: SceneFrame, reach: float, request: TrainRequest) -> np.ndarray:
     """(4, 4) the frame of a field whose core lies around what cameras look at, `reach` from them, or as was
     asked for; its axes are the world's."""
-    radius = CORE[frame.layout] * reach if request.radius is None else request.radius
+    # Half the core's side: in distances between cameras and focus, or, of cameras that look outwards, in
+    # distances of the farthest camera from their middle.
+    share = {"inward": 0.6, "forward-facing": 0.6, "outward": 1.2}[frame.layout]
+    radius = share * reach if request.radius is None else request.radius
     matrix = np.diag([radius, radius, radius, 1.0])
     matrix[:3, 3] = frame.focus if request.centre is None else request.centre
     return matrix

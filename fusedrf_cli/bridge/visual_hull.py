@@ -12,6 +12,7 @@ from formats.silhouettes import shown_pixels
 from formats.views import View
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.rendering.cameras import projected
+from fusedrf_cli.engine.settings import current
 
 
 @dataclass(frozen=True)
@@ -33,12 +34,7 @@ class VisualHullConfig:
     lies beside the object, and only photos tell of it in which it is in line with the object."""
 
 
-def visual_hull(
-    views: Sequence[View],
-    box: np.ndarray,
-    finest: int | None = None,
-    config: VisualHullConfig = VisualHullConfig(),
-) -> OccupancyGrid:
+def visual_hull(views: Sequence[View], box: np.ndarray, finest: int | None = None) -> OccupancyGrid:
     """The smallest box, with cells in it, around those of a box (6,), in world units, that most of the views'
     masks (`amiss`) leave room for an object in; a view says nothing of cells outside its picture, and cells
     that no view shows are left out.
@@ -46,14 +42,15 @@ def visual_hull(
     The alpha of a photo is such a mask. `finest` cells lie along the longest axis (None: `fine`). All cells
     are kept where the masks agree on none. Raises BadMask, BadImage, MissingFile.
     """
+    config = current(VisualHullConfig)
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), config.views)).astype(int))
     with decoders(views) as threads:
         masks = threads.map(partial(Mask.of, config.pixels), [views[i] for i in chosen])
         masked = [mask for mask in masks if mask]
-    around = tight_grid(carved(OccupancyGrid.full(box, config.coarse), masked, config))
+    around = tight_grid(carved(OccupancyGrid.full(box, config.coarse), masked))
     grid = OccupancyGrid.full(around.aabb, finest or config.fine)
     inside = grid.marked(around.contains(grid.centres()).reshape(grid.occupied.shape))
-    return tight_grid(carved(inside, masked, config))
+    return tight_grid(carved(inside, masked))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +79,10 @@ class Mask:
         return self.beside[row, column] - (self.stride - 1)
 
 
-def carved(grid: OccupancyGrid, masked: Sequence[Mask], config: VisualHullConfig) -> OccupancyGrid:
+def carved(grid: OccupancyGrid, masked: Sequence[Mask]) -> OccupancyGrid:
     """The occupied cells of a grid that most masks leave, as `visual_hull` says, in pieces that enough views
     show."""
+    config = current(VisualHullConfig)
     points, reach = grid.centres(), float(np.linalg.norm(grid.cell)) / 2
     shown, excluded = np.zeros((2, len(points)), int)
     for mask in masked:

@@ -9,7 +9,7 @@ from formats.points import SparsePoints
 from formats.views import Capture, View
 from fusedrf_cli.bridge.depth_supervision import certain, known_points
 from fusedrf_cli.bridge.scene_bounds import SceneBounds
-from fusedrf_cli.engine.kernels.loops import DEPTH_TOLERANCE
+from fusedrf_cli.engine.kernels.learning import DEPTH_TOLERANCE
 from tests.formats.test_captures import looking_at
 
 FOCAL = 500.0

@@ -1,7 +1,6 @@
 """The visual hull of a ball whose masks are known in closed form."""
 
 from dataclasses import fields, replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -24,8 +23,8 @@ FISHEYE = (0.05, -0.01, 0.0, 0.0)
 
 
 @pytest.fixture(autouse=True)
-def coarse(monkeypatch):
-    monkeypatch.setattr("fusedrf_cli.bridge.scene_bounds.visual_hull", partial(visual_hull, config=COARSE))
+def coarse(in_force):
+    in_force(COARSE)
 
 
 def views_of(folder, count=16, distortion=(0.0,) * 5, fisheye=False, aside=0.0) -> list[View]:
@@ -64,7 +63,7 @@ def holds_the_ball(grid) -> bool:
 )
 def test_the_hull_of_a_ball(tmp_path, lens):
     """It holds the ball, and little else. In the last case every picture cuts the ball off."""
-    grid = visual_hull(views_of(tmp_path, **lens), BOX, config=COARSE)
+    grid = visual_hull(views_of(tmp_path, **lens), BOX)
     assert holds_the_ball(grid)
     ball = 4 / 3 * np.pi * RADIUS**3
     assert grid.occupied.sum() * grid.cell.prod() < (4 if "aside" in lens else 2) * ball
@@ -88,21 +87,22 @@ def test_pixels_of_a_lens_are_where_its_rays_go(tmp_path):
 
 def test_a_wrong_mask_takes_nothing_away(tmp_path):
     views = views_of(tmp_path)
-    right = visual_hull(views, BOX, config=COARSE)
+    right = visual_hull(views, BOX)
     write_png(views[3].mask_path, np.full((SIDE, SIDE, 3), 0, np.uint8))  # says nothing
     levels = np.zeros((SIDE, SIDE, 3), np.uint8)
     levels[:4, :4] = 255
     write_png(views[5].mask_path, levels)  # excludes the ball
-    wrong = visual_hull(views, BOX, config=COARSE)
+    wrong = visual_hull(views, BOX)
     volume, before = (grid.occupied.sum() * grid.cell.prod() for grid in (wrong, right))
     assert holds_the_ball(wrong) and volume < 1.5 * before
 
 
-def test_large_masks_are_looked_at_in_part(tmp_path):
+def test_large_masks_are_looked_at_in_part(tmp_path, in_force):
     """Every third row and column: the hull holds the ball still, and is not much larger."""
     views = views_of(tmp_path)
-    whole = visual_hull(views, BOX, config=COARSE)
-    part = visual_hull(views, BOX, config=replace(COARSE, pixels=SIDE // 3))
+    whole = visual_hull(views, BOX)
+    in_force(replace(COARSE, pixels=SIDE // 3))
+    part = visual_hull(views, BOX)
     volume, before = (grid.occupied.sum() * grid.cell.prod() for grid in (part, whole))
     assert holds_the_ball(part) and volume < 1.5 * before
 
@@ -113,7 +113,7 @@ def test_masks_that_agree_on_nothing_keep_all(tmp_path):
         levels = np.zeros((SIDE, SIDE, 3), np.uint8)
         levels[(0 if i % 2 else 60) :][:4, (0 if i % 3 else 60) :][:, :4] = 255
         write_png(one.mask_path, levels)
-    found = visual_hull(views, BOX, config=COARSE)
+    found = visual_hull(views, BOX)
     assert found.occupied.all()
     np.testing.assert_allclose(found.aabb, BOX)
 

@@ -12,7 +12,6 @@ from fusedrf_cli.errors import (
     QualityNotReached,
     ResourceProblem,
     UsageProblem,
-    VersionProblem,
 )
 
 MAIN = "from fusedrf_cli.main import main; main()"
@@ -45,7 +44,6 @@ fusedrf_cli.bridge = sys.modules["fusedrf_cli.bridge"] = types.SimpleNamespace(t
         (UsageProblem("no"), 2),
         (InvalidInput("no"), 3),
         (FormatError("no"), 3),
-        (VersionProblem("no"), 4),
         (NewerVersion("no"), 4),
         (ResourceProblem("no"), 5),
         (MemoryError(), 5),

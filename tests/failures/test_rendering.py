@@ -20,7 +20,7 @@ from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import fit
 from fusedrf_cli.engine.distillation.occupancy_update import occupancy_of
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
-from fusedrf_cli.engine.kinds.vm_mlp.field import WIDTH, VMMLPField, untrained
+from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField, VMMLPShape, untrained
 from fusedrf_cli.engine.rendering import volume
 from fusedrf_cli.engine.rendering.cameras import framing_camera, look_at, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
@@ -58,13 +58,13 @@ def as_trained(field):
     """
     if isinstance(field, VMMLPField):
         wide = VMMLPField(
-            replace(field.shape, width=WIDTH), field.box, field.resolution, field.scale, field.shift,
-            occupancy=field.occupancy,
+            replace(field.shape, width=VMMLPShape.width), field.box, field.resolution, field.scale,
+            field.shift, occupancy=field.occupancy,
         )  # fmt: skip
         factors = field.params[: int(field.starts[12]) + field.basis.numel()]
         wide.params[: len(factors)] = factors
         generator = torch.Generator().manual_seed(1)
-        for name, weight in untrained(field.shape.features, WIDTH, generator).items():
+        for name, weight in untrained(field.shape.features, VMMLPShape.width, generator).items():
             wide.weights[name].copy_(weight)
         return wide
     return field

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-import fusedrf_cli
+from formats.bundle import BundleWriter
 from formats.errors import FormatError, OutputExists
+from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge.scene import load_scene, write_field
+from fusedrf_cli.bridge.scene import graph_of, load_scene, write_field
 from fusedrf_cli.engine.composition.composite import as_composite
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -150,11 +151,11 @@ def test_what_a_bundle_keeps_stays_in_it(folder):
     """Its history, and members that no node shows."""
     red = load_scene("red.rfpack").fields[0]
     field = open_scene("blue.rfpack").fields["blue"]
-    kept = {red.member: folder / "red.rfpack"}
+    writer = BundleWriter()
+    member = writer.add_field(FieldRecord(field.kind, *field.state()), "float16")
+    writer.copy_field(folder / "red.rfpack", red.member)
     about = SceneGraph((), history=({"event": "fused"},))
-    write_field(
-        "kept.rfpack", field, "blue", precision="float16", overwrite=False, about=about, kept_sources=kept
-    )
+    writer.write("kept.rfpack", graph_of(member, "blue", None, about), overwrite=False)
     open_scene("kept.rfpack").save("again.rfpack")
     assert Path("again.rfpack").read_bytes() == Path("kept.rfpack").read_bytes()
 
@@ -194,7 +195,7 @@ def test_what_cannot_be_done_is_said():
 
 @pytest.mark.parametrize(
     ("asked", "found"),
-    [({}, fusedrf_cli.SHORT_WAIT), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "None")],
+    [({}, "1000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "None")],
 )
 def test_how_long_threads_wait_is_settled_before_torch_is_loaded_unless_the_user_has_said_it(asked, found):
     code = "import fusedrf_cli, os, sys; print(os.environ.get('GOMP_SPINCOUNT'), 'torch' in sys.modules)"

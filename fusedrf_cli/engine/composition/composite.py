@@ -18,8 +18,8 @@ from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.fields.computed import ComputedField, exact
 from fusedrf_cli.engine.fields.occupancy import box_corners, squeezed
 from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kernels.bundles import RayBatch
 from fusedrf_cli.engine.kernels.instances import (
-    FARTHEST,
     MAX_TRACED,
     Instances,
     PointAnswers,
@@ -28,18 +28,16 @@ from fusedrf_cli.engine.kernels.instances import (
     Traces,
 )
 from fusedrf_cli.engine.kernels.loops import POINTS_PER_TASK, RAYS_PER_TASK
+from fusedrf_cli.engine.kernels.primitives import FARTHEST
 from fusedrf_cli.engine.kernels.segments import (
     SHARED,
     Groups,
-    RayBatch,
     Segments,
     points_in_sphere,
     sort_slots,
 )
 
-MEETING = 8  # instances in one segment of a ray for which there is room at first
 SLOTS_AT_ONCE = 1 << 14  # of which the samples are kept: 20 MB
-ROUNDING = 1e-6  # share of a sphere's radius by which it is larger
 
 
 def can_be_composite(placed: Iterable[Placed], rule: str = "max") -> bool:
@@ -269,10 +267,10 @@ class Waves:
         self.scene, self.early_stop, self.loops = scene, early_stop, scene.device_loops
         self.segment_loops, place = self.loops.segments(), self.loops.on_device
         self.steps = times * scene.instances.step
-        n = len(out)
+        n, meeting = len(out), 8  # instances in one segment of a ray for which there is room at first
         segments = Segments(
             *np.empty((2, n)), np.empty(n, np.int64), np.empty(n), rays.reach[:, 0].copy(),
-            np.empty(n, np.int64), np.empty((n, MEETING), np.int64),
+            np.empty(n, np.int64), np.empty((n, meeting), np.int64),
         )  # fmt: skip
         self.rays, self.out, self.segments = place(rays), place(out), place(segments)
         self.left = np.arange(n)
@@ -388,4 +386,4 @@ def sphere_around(placed: Placed, field: RadianceField) -> np.ndarray:
     corners, matrix = box_corners(field.occupancy.tight_aabb(0)), placed.object_to_world
     middle = corners.mean(0) @ matrix[:3, :3].T + matrix[:3, 3]
     radius = np.linalg.norm((corners - corners.mean(0)) @ matrix[:3, :3].T, axis=1).max()
-    return np.array([*middle, radius * (1 + ROUNDING)])
+    return np.array([*middle, radius * (1 + 1e-6)])  # by a rounding

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.decoders.sh_mlp import OUTPUTS
 from fusedrf_cli.engine.fields.box import ParameterBlock
 from fusedrf_cli.engine.kernels.primitives import add_scaled, dense, dense_backward, dot, rectify, scatter
 
-OUTPUTS = 8  # of the last layer: three colours, filled up to a run
 LAYERS = 3
 
 

@@ -2,9 +2,6 @@
 
 from dataclasses import dataclass
 
-from fusedrf_cli.engine.distillation.depth_points import DepthConfig
-from fusedrf_cli.engine.distillation.exposure import ExposureConfig
-from fusedrf_cli.engine.distillation.poses import PoseConfig
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.builder import StorageSetting
 
@@ -49,12 +46,6 @@ class TrainConfig:
     device: str = "cpu"
     """Where the field is trained, "cpu" or "cuda"."""
 
-    # the parts of the method that have numbers of their own
-
-    exposures: ExposureConfig = ExposureConfig()
-    refining: PoseConfig = PoseConfig()
-    depths: DepthConfig = DepthConfig()
-
     # the optimiser
 
     rate: float = 0.02
@@ -87,9 +78,9 @@ class TrainConfig:
     """The same in unbounded space. Behind what rays meet first there is more to sample there; by as many
     samples of other rays a park of 1,600 steps shows 0.17 dB more held out, ferns 0.09, and no scene less."""
     light: float = 1 / 25
-    """Weight under which a sample's gradient is followed back by chance (loops.py), once there is more than
-    low density. A pass over an unbounded scene takes three quarters of the time and half as many numbers
-    change: a park shows 0.15 dB more in the time; with 1/5 it loses as much."""
+    """Weight under which a sample's gradient is followed back by chance (kernels/learning.py), once there is
+    more than low density. A pass over an unbounded scene takes three quarters of the time and half as many
+    numbers change: a park shows 0.15 dB more in the time; with 1/5 it loses as much."""
     distortion: float = 0.012
     """Weight of that loss in unbounded space; in a box surfaces come out sharp without it."""
     settled: float = 0.25

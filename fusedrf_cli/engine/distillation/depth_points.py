@@ -8,6 +8,7 @@ import torch
 
 from fusedrf_cli.engine.distillation.shuffle import Shuffle
 from fusedrf_cli.engine.rendering.cameras import Camera, projected
+from fusedrf_cli.engine.settings import current
 
 
 @dataclass(frozen=True)
@@ -43,10 +44,8 @@ class DepthPoints:
         known: KnownPoints,
         ignored: np.ndarray | None,
         generator: torch.Generator,
-        config: DepthConfig = DepthConfig(),
     ):
         """ignored (P,) bool: pixels, counted picture after picture, that must not be drawn."""
-        self.config = config
         first = np.cumsum([0, *(camera.width * camera.height for camera in cameras)])
         pixels = np.full(len(known.points), -1)
         for i, camera in enumerate(cameras):
@@ -63,9 +62,10 @@ class DepthPoints:
 
     def wanted(self, rays: int, share: float) -> int:
         """How many of them a step of so many rays takes after a share of the run."""
-        if share >= self.config.until:
+        config = current(DepthConfig)
+        if share >= config.until:
             return 0
-        return min(round(self.config.share * rays), -(-len(self.points) // self.config.apart))
+        return min(round(config.share * rays), -(-len(self.points) // config.apart))
 
     def draw(self, count: int) -> tuple[torch.Tensor, np.ndarray]:
         """Pixels (count,) int64, counted picture after picture, and the points (count, 3) that they show; or

@@ -15,10 +15,6 @@ import torch
 
 from fusedrf_cli.engine.distillation.evaluation import HoldOutRays, scattered_evaluator
 from fusedrf_cli.engine.distillation.losses import (
-    DensityLoss,
-    Visibility,
-    log_depth,
-    mostly_seen,
     point_step,
 )
 from fusedrf_cli.engine.distillation.nan_guard import NanGuard
@@ -30,26 +26,14 @@ from fusedrf_cli.engine.distillation.schedule import Schedule
 from fusedrf_cli.engine.distillation.shuffle import Shuffle
 from fusedrf_cli.engine.distillation.student import halved, pruned, resampled_like, starts_coarse
 from fusedrf_cli.engine.distillation.teacher import (
-    Chance,
     TeacherSamples,
     query_teacher,
     render_teacher,
-    surface_first,
 )
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField, sampling_step
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.kinds.builder import DistilConfig
 from fusedrf_cli.engine.settings import current
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """The parts of the method."""
-
-    chance: Chance = surface_first
-    density_loss: DensityLoss = log_depth
-    visibility: Visibility = mostly_seen
-    schedule: type[Schedule] = Schedule
 
 
 @dataclass
@@ -99,14 +83,13 @@ class DistillRun:
         sampler: RaySampler,
         config: DistilConfig,
         rgb: bool = True,
-        recipe: Recipe = Recipe(),
         evaluator: Callable[[StoredField], float] | None = None,
     ):
-        """The arguments are those of `distill`; the recipe is for measuring what its parts are worth. The
-        evaluator says how near a student comes, in dB; None: one of the same teacher and config.
+        """The arguments are those of `distill`. The evaluator says how near a student comes, in dB; None: one
+        of the same teacher and config.
         """
         self.teacher, self.sampler, self.rgb, self.evaluator = teacher, sampler, rgb, evaluator
-        self.config, self.recipe, self.step = config, recipe, sampling_step(student)
+        self.config, self.step = config, sampling_step(student)
         coarse = config.steps > 0 and starts_coarse(student, config.coarse_from)
         self.student, self.refined = (halved(student), student) if coarse else (student, None)
         """What learns now, and, while that is coarse, the student whose resolution it will take."""
@@ -118,7 +101,7 @@ class DistillRun:
         self.phase, self.steps, self.elapsed = "points", 0, 0.0
         self.learnt_seconds = 0.0
         """That this process has learnt for."""
-        self.schedule = recipe.schedule(config)
+        self.schedule = Schedule(config)
         self.began = working_time()
         self.before: torch.Tensor | None = None
         """The student's numbers before the RGB phase."""
@@ -147,9 +130,7 @@ class DistillRun:
         )
         rays_o, rays_d = self.sampler.draw(config.rays, self.generator)
         if config.steps:
-            dataset = query_teacher(
-                self.teacher, rays_o, rays_d, self.step, self.generator, self.recipe.chance
-            )
+            dataset = query_teacher(self.teacher, rays_o, rays_d, self.step, self.generator)
         else:
             dataset = render_teacher(self.teacher, rays_o, rays_d)
         held_out = HoldOutRays(self.teacher, self.sampler, self.step, config.seed)
@@ -192,7 +173,7 @@ class DistillRun:
             self.nan_guard.renew()
         self.report.steps["points"] = self.steps
         self.phase, self.steps, self.elapsed = "pictures", 0, 0.0
-        self.schedule = self.recipe.schedule(self.config)
+        self.schedule = Schedule(self.config)
 
     def _refine(self) -> None:
         """Go on at the full resolution, with moments that start anew."""
@@ -348,10 +329,9 @@ class PointPass:
 
     def __call__(self) -> tuple[np.ndarray, dict]:
         """Leave the gradient of the next points with the optimiser; the losses, and figures to tell."""
-        run, recipe = self.run, self.run.recipe
+        run = self.run
         points = self.pool.points.batch(run.steps, run.config.points_per_step)
-        how = recipe.density_loss, recipe.visibility
-        loss = point_step(run.student, points, run.step, run.optimiser, *how)
+        loss = point_step(run.student, points, run.step, run.optimiser)
         return np.array([loss]), {"loss": loss}
 
 

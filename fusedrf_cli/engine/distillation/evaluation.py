@@ -28,9 +28,6 @@ class EvaluatorConfig:
     """Views the student is judged on are drawn from a stream of their own."""
 
 
-WHITE = np.ones(3)
-
-
 @dataclass(frozen=True)
 class Evaluation:
     """How like its teacher a student is, PSNR in dB over white."""
@@ -53,12 +50,12 @@ class Evaluator:
         `render_image`)."""
         self.cameras, self.origin = cameras, origin
         shots = [render_image(teacher, camera, origin=origin) for camera in cameras]
-        self.truth = np.stack([shot.over(WHITE) for shot in shots])
+        self.truth = np.stack([shot.over() for shot in shots])
         self.covered = np.stack([shot.opacity > current(EvaluatorConfig).covered for shot in shots])
 
     def shots(self, student: RadianceField) -> np.ndarray:
         """(views, H, W, 3) over white."""
-        return np.stack([render_image(student, c, origin=self.origin).over(WHITE) for c in self.cameras])
+        return np.stack([render_image(student, c, origin=self.origin).over() for c in self.cameras])
 
     def __call__(self, student: RadianceField) -> float:
         """PSNR in dB of all pixels of all views together, over white."""

@@ -16,6 +16,7 @@ from fusedrf_cli.engine.distillation.poses import Poses
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.kernels.primitives import CLIPPED
 from fusedrf_cli.engine.rendering.volume import render_rays
+from fusedrf_cli.engine.settings import current
 
 
 @dataclass(frozen=True)
@@ -58,34 +59,34 @@ class ExposureConfig:
     """Of a photo that maps do not explain, against one that they do."""
 
 
-def rays_of_each(photos: int, config: ExposureConfig = ExposureConfig()) -> int:
+def rays_of_each(photos: int) -> int:
     """How many rays of each photo maps are found from."""
+    config = current(ExposureConfig)
     return int(np.clip(config.rays // photos, *config.rays_of_each))
 
 
-def matched(
-    photos: torch.Tensor, poses: Poses, config: ExposureConfig = ExposureConfig()
-) -> np.ndarray | None:
+def matched(photos: torch.Tensor, poses: Poses) -> np.ndarray | None:
     """Maps of photos by many people, of which m colours each are known, (n, m, 3) in [0, 1] and not finite
     where they do not count: those by which mean and deviation of all are alike. None where photos that were
     taken side by side are alike as they are."""
+    config = current(ExposureConfig)
     known, values = torch.isfinite(photos), torch.nan_to_num(photos.double())
     count = known.sum(1).clamp(min=1)
     mean = values.sum(1) / count
     deviation = (torch.where(known, (values - mean[:, None]) ** 2, 0.0).sum(1) / count).sqrt().numpy()
     mean = mean.numpy()
     logs = np.log(mean + 0.01)
-    first, second = side_by_side(poses, config)
+    first, second = side_by_side(poses)
     if len(first) < len(mean) / 2 or np.median(abs(logs[first] - logs[second])) < config.apart:
         return None
     gain = np.clip(deviation / np.median(deviation, 0), *config.gains)
     offset = np.clip(mean - gain * np.median(mean, 0), *config.offsets)
     bright = np.stack([gain / np.quantile(gain, config.bright, axis=0), np.zeros_like(gain)], 1)
     maps = gauged(gain, offset, bright)
-    return weighed(maps, maps[:, 0], config)
+    return weighed(maps, maps[:, 0])
 
 
-def side_by_side(poses: Poses, config: ExposureConfig = ExposureConfig()) -> tuple[np.ndarray, np.ndarray]:
+def side_by_side(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
     """(m,) and (m,) photos, and of each the one that was taken nearest to it, looking the same way; without
     those that have none beside them."""
     position = poses.position - poses.position.mean(0)
@@ -95,7 +96,7 @@ def side_by_side(poses: Poses, config: ExposureConfig = ExposureConfig()) -> tup
     for i, stand in enumerate(stands):
         away = np.linalg.norm(stands - stand, axis=1)
         away[i] = np.inf
-        if away.min() < config.beside:
+        if away.min() < current(ExposureConfig).beside:
             pairs.append((i, away.argmin()))
     first, second = np.array(pairs, np.int64).reshape(-1, 2).T
     return first, second
@@ -107,7 +108,6 @@ def measured(
     photos: torch.Tensor,
     near: float,
     before: np.ndarray | None,
-    config: ExposureConfig = ExposureConfig(),
 ) -> np.ndarray | None:
     """Maps of photos by what a field shows, in the least squares; None where none were known `before` and the
     photos do not surely differ.
@@ -116,19 +116,21 @@ def measured(
     their colours in [0, 1], not finite where they do not count. A photo of which too few rays show the field
     has the identity.
     """
+    config = current(ExposureConfig)
     n, m, _ = photos.shape
     rendered = torch.from_numpy(render_rays(field, *rays, near=near)).reshape(n, m, 5).double()
     shown = rendered[..., :3] / rendered[..., 3:4].clamp(min=config.opaque)
     truth = torch.where(rendered[..., 3:4] > config.opaque, photos.double(), torch.nan)
-    if before is None and not differ(shown, truth, config):
+    if before is None and not differ(shown, truth):
         return None
-    return fitted(shown, truth, before, config)
+    return fitted(shown, truth, before)
 
 
-def differ(shown: torch.Tensor, truth: torch.Tensor, config: ExposureConfig = ExposureConfig()) -> bool:
+def differ(shown: torch.Tensor, truth: torch.Tensor) -> bool:
     """Whether photos (n, m, 3), nan where they do not count, are surely brighter and darker, one than the
     other, than the colours that a field shows for them: by their gains of least squares, of which `sure`
     standard errors do not count (the positive part of James and Stein's estimate)."""
+    config = current(ExposureConfig)
     counts = torch.isfinite(truth) & (truth < CLIPPED)
     product, square = (torch.where(counts, shown * other, 0.0).sum(1) for other in (truth, shown))
     number = counts.sum(1)
@@ -142,17 +144,13 @@ def differ(shown: torch.Tensor, truth: torch.Tensor, config: ExposureConfig = Ex
     return float((logs - logs.mean(0)).square().mean().sqrt()) > config.same
 
 
-def fitted(
-    shown: torch.Tensor,
-    truth: torch.Tensor,
-    before: np.ndarray | None = None,
-    config: ExposureConfig = ExposureConfig(),
-) -> np.ndarray:
+def fitted(shown: torch.Tensor, truth: torch.Tensor, before: np.ndarray | None = None) -> np.ndarray:
     """Maps of photos (n, m, 3), nan where they do not count, that show `shown`, from those `before` on.
 
     Least squares, some times over: each time, pixels that are far off (`fair`, Cauchy's weights) count less.
     Those at an end of a photo's range count from the second time on, where they are not beyond it.
     """
+    config = current(ExposureConfig)
     counts = torch.isfinite(truth)
     truth = torch.nan_to_num(truth)
     start = identity(len(truth)) if before is None else before
@@ -175,7 +173,7 @@ def fitted(
         error = truth - gain * shown - offset
         used = counts & ~(bright & (error < 0)) & ~(dark & (error > 0))
     missed = (torch.where(used, error**2, 0.0).sum(1) / used.sum(1).clamp(min=1)).sqrt()
-    return weighed(gauged(gain[:, 0].numpy(), offset[:, 0].numpy(), start), missed.numpy(), config)
+    return weighed(gauged(gain[:, 0].numpy(), offset[:, 0].numpy(), start), missed.numpy())
 
 
 def identity(n: int) -> np.ndarray:
@@ -190,12 +188,12 @@ def gauged(gain: np.ndarray, offset: np.ndarray, like: np.ndarray) -> np.ndarray
     return np.stack([gain, offset + gain * (like[:, 1] - offset).mean(0) / gain.mean(0)], 1)
 
 
-def weighed(maps: np.ndarray, missed: np.ndarray, config: ExposureConfig = ExposureConfig()) -> np.ndarray:
+def weighed(maps: np.ndarray, missed: np.ndarray) -> np.ndarray:
     """Maps (n, 2, 3) with weights, of photos that are off by root mean squares (n, 3): an error counts as the
     colour of the field that it is due to, and less in a photo that is off by more of that than the median."""
     off = missed / maps[:, 0]
     fair = np.median(off, 0) / np.maximum(off, 1e-9)
-    weight = np.clip(fair**2, config.least_weight, 1) / maps[:, 0] ** 2
+    weight = np.clip(fair**2, current(ExposureConfig).least_weight, 1) / maps[:, 0] ** 2
     return np.concatenate([maps, weight[:, None]], 1)
 
 

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.distillation.config import TrainConfig
-from fusedrf_cli.engine.distillation.depth_points import DepthPoints, KnownPoints
+from fusedrf_cli.engine.distillation.depth_points import DepthConfig, DepthPoints, KnownPoints
 from fusedrf_cli.engine.distillation.exposure import (
+    ExposureConfig,
     matched,
     measured,
     rays_of_each,
@@ -24,6 +25,7 @@ from fusedrf_cli.engine.distillation.occupancy_update import (
 )
 from fusedrf_cli.engine.distillation.optimiser import Adam, alike
 from fusedrf_cli.engine.distillation.poses import (
+    PoseConfig,
     Poses,
     changed,
     refined,
@@ -81,9 +83,9 @@ class FitRun:
         self.maps: np.ndarray | None = None
         """(n, 3, 3) what each picture makes of the field's colours (exposure.py); None: nothing."""
         if config.exposure:
-            self.maps = matched(self.sampled()[1], dataset.poses, config.exposures)
-        self.exposures = list(config.exposures.at) if config.exposure else []
-        self.refinements = list(config.refining.at) if config.poses else []
+            self.maps = matched(self.sampled()[1], dataset.poses)
+        self.exposures = list(current(ExposureConfig).at) if config.exposure else []
+        self.refinements = list(current(PoseConfig).at) if config.poses else []
         self.mse, self.rays = None, self.config.least_rays
         self.found_density, self.found_nothing = False, 0
         self.held: tuple[dict[str, np.ndarray], dict] | None = None
@@ -112,7 +114,7 @@ class FitRun:
         if limits is not None:
             field = field.with_occupancy(limits)
         ignored = None if dataset.ignored is None else dataset.ignored.numpy()
-        shown = None if known is None else DepthPoints(cameras, known, ignored, generator, config.depths)
+        shown = None if known is None else DepthPoints(cameras, known, ignored, generator)
         return cls(field, dataset, config, generator, limits, shown)
 
     def finish(
@@ -259,9 +261,7 @@ class FitRun:
         if self.exposures and share >= self.exposures[0]:
             self.exposures.pop(0)
             rays, colours = self.sampled()
-            self.maps = measured(
-                self.field, rays, colours, self.config.near, self.maps, self.config.exposures
-            )
+            self.maps = measured(self.field, rays, colours, self.config.near, self.maps)
         if self.refinements and share >= self.refinements[0]:
             self.refinements.pop(0)
             if self.found_density:
@@ -269,20 +269,20 @@ class FitRun:
 
     def refine_poses(self, share: float) -> None:
         """Move each picture's camera to where the field shows it better."""
-        dataset, how = self.pool, self.config.refining
+        dataset, how = self.pool, current(PoseConfig)
         most = int(np.clip(how.rays // len(dataset.pixel), *how.rays_of_each))
         *rays, colours = dataset.sample(most, self.generator)
         first, last = how.tried_by
         pixels = max(last, first * (last / first) ** (2 * share))
         colours = colours if self.maps is None else undone(self.maps, colours)
-        change = refined(self.field, rays, colours, self.config.near, pixels * dataset.pixel, how)
+        change = refined(self.field, rays, colours, self.config.near, pixels * dataset.pixel)
         dataset.set_poses(changed(dataset.poses, change))
 
     def sampled(self) -> tuple[list[np.ndarray], torch.Tensor]:
         """Rays and colours of each picture from which its exposure is found. They are drawn apart, so that
         looking changes nothing."""
         apart = torch.Generator().manual_seed(self.steps)
-        *rays, colours = self.pool.sample(rays_of_each(len(self.pool.pixel), self.config.exposures), apart)
+        *rays, colours = self.pool.sample(rays_of_each(len(self.pool.pixel)), apart)
         return rays, colours
 
     def refresh_occupancy(self) -> None:
@@ -371,7 +371,7 @@ class FitRun:
             config.unbounded_early_stop if config.unbounded else config.early_stop,
             min(1.0, share / config.settled) * config.distortion if config.unbounded else 0.0,
             config.light if share > config.settled else 0.0,
-            config.depths.weight,
+            current(DepthConfig).weight,
             depths,
             exposure,
         )

@@ -1,6 +1,5 @@
 """The 3D losses: how a student's σ and colour at points differ from what a teacher said there."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -27,15 +26,10 @@ class LossConfig:
     """What a point counts that nothing is seen of from this ray: from another one it may be."""
 
 
-DensityLoss = Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
-"""Losses (N,) of the student's optical depths (N,) of a step against the wanted ones (N,), and their
-derivatives (N,) by the student's."""
-Visibility = Callable[[torch.Tensor], torch.Tensor]
-"""What points count (N,), by the transmittance (N,) of their rays up to them."""
-
-
 def log_depth(depth: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """(log1p(g τ_s) - log1p(g τ_t))², with depths beyond `opaque` taken as equal: they look the same.
+    """Losses (N,) of the student's optical depths (N,) of a step against the wanted ones (N,), and their
+    derivatives (N,) by the student's: (log1p(g τ_s) - log1p(g τ_t))², with depths beyond `opaque` taken as
+    equal: they look the same.
 
     Raw σ is unstable for dense teachers, and alpha gives a saturated student no gradient; this does.
     """
@@ -47,29 +41,23 @@ def log_depth(depth: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, 
 
 
 def mostly_seen(transmittance: torch.Tensor) -> torch.Tensor:
-    """By what is seen of a point, with a share for all: what this ray does not show another one may."""
+    """What points count (N,), by the transmittance (N,) of their rays up to them: by what is seen of a point,
+    with a share for all, since what this ray does not show another one may."""
     config = current(LossConfig)
     return config.hidden_share + (1 - config.hidden_share) * transmittance
 
 
-def point_step(
-    student: RadianceField,
-    points: TeacherPoints,
-    step: float,
-    optimiser: Adam,
-    density_loss: DensityLoss = log_depth,
-    visibility: Visibility = mostly_seen,
-) -> float:
+def point_step(student: RadianceField, points: TeacherPoints, step: float, optimiser: Adam) -> float:
     """Mean loss of points, its gradient added to the optimiser's: the density's at optical depths τ = σ step,
     and the squared length of the colour's error by `colour_weight` times the teacher's alpha, both by
     visibility."""
     config = current(LossConfig)
     sigma, rgb = student.query(points.where, points.dirs)
     tau, target = sigma * step, points.sigma * step
-    loss, d_tau = density_loss(tau, target)
+    loss, d_tau = log_depth(tau, target)
     # σ = softplus(f) and its slope vanish together: far below `faint` the gradient would be too small
     lift = torch.where(d_tau < 0, (config.faint / tau).clamp(1, config.most_lift), 1)
-    counts = visibility(points.transmittance) / len(points)
+    counts = mostly_seen(points.transmittance) / len(points)
     shown = config.colour_weight * counts * (1 - torch.exp(-target))
     off = rgb - points.rgb
     student.query_backward(

@@ -27,10 +27,6 @@ class OccupancyUpdateConfig:
     """Mean square by which pictures differ that show the same: 60 dB."""
 
 
-# Where in a cell low density is looked for: about as close together as the texels of a fine field.
-CLOSE_PROBES = np.stack(np.meshgrid(*[(np.arange(4) + 0.5) / 4] * 3, indexing="ij"), -1).reshape(-1, 3)
-
-
 def occupancy_of(
     field: StoredField, box: np.ndarray | None = None, cells: int | None = None
 ) -> OccupancyGrid:
@@ -79,7 +75,9 @@ def prune_low_density(
     every picture.
     """
     config = current(OccupancyUpdateConfig)
-    grid, depth = field.occupancy, depths_across(field, CLOSE_PROBES)
+    # about as close together as the texels of a fine field
+    probes = np.stack(np.meshgrid(*[(np.arange(4) + 0.5) / 4] * 3, indexing="ij"), -1).reshape(-1, 3)
+    grid, depth = field.occupancy, depths_across(field, probes)
     full = render_rays(field, rays_o, rays_d, near=near)[:, :4]
     expected, most = (full, config.empty_below) if truth is None else (truth, config.first_prune_depth)
     allowed = np.square(full - expected).mean() + config.same

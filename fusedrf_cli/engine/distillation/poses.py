@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import render_rays
+from fusedrf_cli.engine.settings import current
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,6 @@ def refined(
     photos: torch.Tensor,
     near: float,
     probe: np.ndarray,
-    config: PoseConfig = PoseConfig(),
 ) -> np.ndarray:
     """(n, 6) float64: by which angles about the frame's axes (3, radians) each of n photos' cameras is to be
     turned, and by how much moved (3), so that the field shows their colours better: one damped step of Gauss
@@ -72,6 +72,7 @@ def refined(
     rays: origins and unit directions (n * m, 3), m of each photo in order; photos (n, m, 3) their colours in
     [0, 1], not finite where they do not count. probe (n,): the angle in radians by which each is tried.
     """
+    config = current(PoseConfig)
     n, m, _ = photos.shape
     o, d = (part.reshape(n, m, 3) for part in rays)
     truth = photos.double().numpy()
@@ -95,7 +96,7 @@ def refined(
     )
     scale = np.concatenate([np.tile(probe[:, None], 3), np.tile((probe * afar)[:, None], 3)], 1)
     slopes = np.stack([shown(scale * axis, every)[..., :3] - now[..., :3] for axis in np.eye(6)], -1)
-    step = scale * step_of(slopes, missed, fair, config)
+    step = scale * step_of(slopes, missed, fair)
 
     def error(colours: np.ndarray, which: np.ndarray) -> np.ndarray:
         """(k,) of those photos, robust."""
@@ -111,15 +112,14 @@ def refined(
     return change
 
 
-def step_of(
-    slopes: np.ndarray, missed: np.ndarray, fair: np.ndarray, config: PoseConfig = PoseConfig()
-) -> np.ndarray:
+def step_of(slopes: np.ndarray, missed: np.ndarray, fair: np.ndarray) -> np.ndarray:
     """(n, 6) of n photos, in probes: by how much all six parameters change, damped, drawn towards none by as
     much as noise alone would change, and held to `largest`.
 
     slopes (n, m, 3, 6) of the colours of their m rays, missed (n, m, 3) by how much these are off, fair
     (n, m) how much each ray counts.
     """
+    config = current(PoseConfig)
     square = np.einsum("nm,nmcp,nmcq->npq", fair, slopes, slopes)
     square += config.damping * np.einsum("npp->np", square)[:, :, None] * np.eye(6) + 1e-9 * np.eye(6)
     step = -np.linalg.solve(square, np.einsum("nm,nmcp,nmc->np", fair, slopes, missed)[..., None])[..., 0]

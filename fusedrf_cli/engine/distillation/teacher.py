@@ -2,7 +2,6 @@
 rays.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,12 +34,9 @@ class TeacherConfig:
     """Of which the number of points is reckoned."""
 
 
-Chance = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
-"""The chances (N,) that samples are kept as points, by their optical depths (N,) and transmittances (N,)."""
-
-
-def surface_first(depth: torch.Tensor, transmittance: torch.Tensor) -> torch.Tensor:
-    """All that can be seen of density, and a share of the emptiness before it."""
+def surface_first(depth: torch.Tensor) -> torch.Tensor:
+    """The chances (N,) that samples are kept as points, by their optical depths (N,): all that can be seen of
+    density, and a share of the emptiness before it."""
     config = current(TeacherConfig)
     return torch.where(depth > config.occupied_depth, 1.0, config.empty_share)
 
@@ -98,7 +94,6 @@ def query_teacher(
     rays_d: np.ndarray,
     step: float,
     generator: torch.Generator,
-    chance: Chance = surface_first,
 ) -> TeacherSamples:
     """Render rays (R, 3) through a teacher and keep some samples in front of what is opaque as points, in
     random order.
@@ -106,7 +101,7 @@ def query_teacher(
     parts, at_once = [], current(RenderConfig).rays_at_once
     for start in range(0, len(rays_o), at_once):
         part = slice(start, start + at_once)
-        parts.append(_ask_part(teacher, rays_o[part], rays_d[part], step, generator, chance))
+        parts.append(_ask_part(teacher, rays_o[part], rays_d[part], step, generator))
     pixels, *columns = (list(column) for column in zip(*parts, strict=True))
     parts.clear()
     order = torch.randperm(sum(map(len, columns[0])), generator=generator, dtype=torch.int32)
@@ -151,7 +146,6 @@ def _ask_part(
     rays_d: np.ndarray,
     step: float,
     generator: torch.Generator,
-    chance: Chance,
 ) -> tuple[torch.Tensor, ...]:
     teacher_config = current(TeacherConfig)
     config = current(RenderConfig)
@@ -172,7 +166,7 @@ def _ask_part(
         trans[ray] = after
         depth = densities * torch.from_numpy(spans[mask]).float()
         chosen = (before > teacher_config.seen) & (
-            torch.rand(len(points), generator=generator) < chance(depth, before)
+            torch.rand(len(points), generator=generator) < surface_first(depth)
         )
         # most samples are empty, and a colour costs more than a density
         shown = torch.from_numpy(weights[mask] > config.seen_weight) | (chosen & (depth > config.seen_weight))

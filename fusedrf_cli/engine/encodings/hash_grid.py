@@ -16,8 +16,6 @@ from fusedrf_cli.engine.kernels.prefetch import prefetch
 from fusedrf_cli.engine.kernels.primitives import accumulate
 from fusedrf_cli.engine.kernels.reference import OCTANTS, whole
 
-FILLED = 8  # rows of a level are filled up to a multiple of
-
 
 class Arrays(NamedTuple):
     """What the functions read beside `params`."""
@@ -32,7 +30,7 @@ def levels_of(levels: int, log2_rows: int, base: int, growth: float) -> tuple[np
     """(LEVELS,) scales, vertices per axis and rows of each level."""
     scales = base * np.asarray(growth, np.float64) ** np.arange(levels) - 1
     sides = np.ceil(scales).astype(np.int64) + 1
-    rows = np.minimum(-(-(sides**3) // FILLED) * FILLED, 1 << log2_rows)
+    rows = np.minimum(-(-(sides**3) // 8) * 8, 1 << log2_rows)  # filled up to a multiple of eight
     return scales, sides, rows
 
 
@@ -41,29 +39,25 @@ def sizes(levels: int, features: int, log2_rows: int, base: int, growth: float) 
     return {"LEVELS": levels, "FEATURES": features, "WIDTH": levels * features}
 
 
-def sections(
-    resolution: tuple[int, int, int], levels: int, features: int, log2_rows: int, base: int, growth: float
-) -> list[ParameterBlock]:
-    """See encodings; levels do not depend on the resolution. Drawn as in the paper (sec. 4), but normal."""
-    rows = int(levels_of(levels, log2_rows, base, growth)[2].sum())
+def sections(resolution: tuple[int, int, int], features: int, **grid: int | float) -> list[ParameterBlock]:
+    """See encodings; grid: see `levels_of`, which does not depend on the resolution. Drawn as in the paper
+    (sec. 4), but normal."""
+    rows = int(levels_of(**grid)[2].sum())
     return [ParameterBlock("rows", (rows, features), spread=1e-4)]
 
 
-def arrays(
-    field, starts: np.ndarray, levels: int, features: int, log2_rows: int, base: int, growth: float
-) -> Arrays:
+def arrays(field, starts: np.ndarray, features: int, **grid: int | float) -> Arrays:
     """See encodings."""
-    scales, sides, rows = levels_of(levels, log2_rows, base, growth)
+    scales, sides, rows = levels_of(**grid)
     return Arrays(starts[0] + features * (np.cumsum(rows) - rows), scales, sides, rows)
 
 
 def reference(
-    field, sections: dict, unit: torch.Tensor, read: None, levels: int, features: int, log2_rows: int,
-    base: int, growth: float,
-) -> torch.Tensor:  # fmt: skip
+    field, sections: dict, unit: torch.Tensor, read: None, features: int, **grid: int | float
+) -> torch.Tensor:
     """See encodings."""
     per_level, first, table = [], 0, sections["rows"]
-    for scale, side, rows in zip(*levels_of(levels, log2_rows, base, growth), strict=True):
+    for scale, side, rows in zip(*levels_of(**grid), strict=True):
         at = unit * float(scale) + 0.5
         below = at.detach().floor()
         total = table.new_zeros(len(unit), features)

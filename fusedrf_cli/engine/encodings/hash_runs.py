@@ -19,9 +19,6 @@ RUN = 4  # rows that lie side by side along z, so that neighbours share a cache 
 ROW = 4  # numbers of a row: density, then red, green and blue
 PRIMES = 2654435761, 805459861, 3674653429  # that numbers of vertices are multiplied by
 EMPTY_FROM = -6.0  # density before activation, shift included, under which none is asked for
-STEPS = 2.0  # of its finest spacing from one sample of a picture to the next
-MAX_LEVELS, MAX_ROWS = 8, 1 << 24
-MAX_VERTEX = 1 << 20  # along an axis: past it, float32 would not tell where between two a point is
 
 
 @dataclass(frozen=True)
@@ -53,8 +50,8 @@ class HashGrid:
 
     @property
     def picture_step(self) -> float:
-        """At which pictures sample it."""
-        return STEPS * min(self.spacings)
+        """At which pictures sample it: twice its finest spacing."""
+        return 2.0 * min(self.spacings)
 
 
 class Arrays(NamedTuple):

@@ -11,7 +11,6 @@ from fusedrf_cli.engine.kernels import reference as torch_reference
 from fusedrf_cli.engine.kernels.prefetch import prefetch_plane
 from fusedrf_cli.engine.kernels.primitives import bilinear, linear, scatter, store_8, texel
 
-SPREAD = 0.1  # TensoRF's, of an untrained field's numbers
 MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
 
 
@@ -29,7 +28,7 @@ def sizes(rank: int) -> dict[str, int]:
 
 def sections(resolution: tuple[int, int, int], rank: int) -> list[ParameterBlock]:
     """See encodings."""
-    n, drawn = resolution, {"spread": SPREAD}
+    n, drawn = resolution, {"spread": 0.1}  # TensoRF's
     planes = [
         ParameterBlock(f"plane_{m}", (n[a], n[b], rank), (a, b), **drawn) for m, (a, b, _) in enumerate(MODES)
     ]

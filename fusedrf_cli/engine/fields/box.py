@@ -20,9 +20,9 @@ from fusedrf_cli.engine.fields.computed import (
     unpack_bits,
 )
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kernels.primitives import LINE
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
-LINE = 16  # floats: a part begins on a cache line
 MAX_TEXELS = 8192  # per axis, in a stored field
 MAX_ANSWER = 1e25  # of a density or a logit: finite in float32 also after a placement's largest stretch
 DENSITY_SHIFT = -8.0  # softplus(-8) * 75 * sqrt(3) = 4 % opacity along the diagonal of an untrained box

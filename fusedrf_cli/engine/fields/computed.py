@@ -15,21 +15,21 @@ from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.fields.base import FieldMemory
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
-from fusedrf_cli.engine.kernels.instances import FARTHEST, Slots
+from fusedrf_cli.engine.kernels.instances import Slots
+from fusedrf_cli.engine.kernels.learning import QueryGradients
 from fusedrf_cli.engine.kernels.loops import (
     RAYS_PER_TASK,
     Cells,
     PointBatch,
     PointValues,
-    QueryGradients,
     VoteRays,
     WeightRays,
 )
+from fusedrf_cli.engine.kernels.primitives import FARTHEST
 
 BRICK = 4  # cells a side
-FEW_CELLS, MOST_CELLS = 1 << 22, 1 << 26
-"""Of a grid up to which files have its bits one after the other, and that is read in bricks: no grid of a fit
-has more than the first."""
+FEW_CELLS = 1 << 22
+"""Of a grid up to which files have its bits one after the other: no grid of a fit has more."""
 StoredAs = Callable[[np.ndarray, str, np.ndarray | None], np.ndarray]
 """The numbers that an array (V, C) comes back with from a bundle: of the array, its name and the lengths of
 the runs of its rows, or None."""
@@ -299,9 +299,8 @@ class ComputedField:
         query = WeightRays(exact(rays_o), exact(rays_d), exact(jitter), float(near), float(step), 1e-3)
         parts = self.gradient_rows
         most = np.zeros((parts, self.occupancy.occupied.size), np.float32)
-        self.loops.sweep(
-            "weigh_ray", self.arrays, self.grid, query, len(rays_o), 1, most, np.zeros((parts, 3))
-        )
+        out = most, np.zeros((parts, 3))
+        self.loops.sweep("weigh_ray", self.arrays, self.grid, query, len(rays_o), 1, out)
         return most.max(0).reshape(self.occupancy.occupied.shape)
 
     def votes(
@@ -323,9 +322,8 @@ class ComputedField:
         )  # fmt: skip
         parts = self.gradient_rows
         sums = np.zeros((parts, 2 * cells.occupied.size), np.float32)
-        self.loops.sweep(
-            "vote_ray", self.arrays, self.grid, query, len(rays_o), 1, sums, np.zeros((parts, 3))
-        )
+        out = sums, np.zeros((parts, 3))
+        self.loops.sweep("vote_ray", self.arrays, self.grid, query, len(rays_o), 1, out)
         return np.moveaxis(sums.sum(0).reshape(*counts, 2), -1, 0)
 
     # -- learning ----------------------------------------------------------------------------------------
@@ -342,9 +340,8 @@ class ComputedField:
         (N, 3) of a loss send back to `params`."""
         d_sigma, d_rgb = as_array(d_sigma, self.real), as_array(d_rgb, self.real)
         sent = QueryGradients(exact(points), exact(dirs), d_sigma, d_rgb)
-        unused = np.zeros((len(grads), 3))
-        most = 1, grads, unused
-        self.loops.sweep("query_point_backward", self.arrays, self.grid, sent, len(points), *most)
+        out = grads, np.zeros((len(grads), 3))
+        self.loops.sweep("query_point_backward", self.arrays, self.grid, sent, len(points), 1, out)
         self.collect(grads)
 
     def train_rays(self, batch: Batch, grads: np.ndarray, loss: np.ndarray) -> None:
@@ -361,7 +358,7 @@ class ComputedField:
         one-sided where a photo's range ends (kernels/primitives.py, `within_range`), and the squares are
         weighted. loss (parts, 3) gains the sums over rays of the colour term, not weighted, where no depth is
         known, of the opacity term and of the samples taken. With batch.light above 0 the gradient is an
-        estimate, whose mean over jitters is that of the loss (loops.py, `stochastic_backprop`).
+        estimate, whose mean over jitters is that of the loss (learning.py, `stochastic_backprop`).
         """
         count = len(batch.rays_o)
         most = self.space.most_samples(self.aabb, batch.step)
@@ -370,7 +367,7 @@ class ComputedField:
             as_array(batch.background, self.real), *map(float, batch[5:-2]), exact(batch.depths),
             exact(batch.exposure),
         )  # fmt: skip
-        self.loops.sweep("train_ray", self.arrays, self.grid, batch, count, most, grads, loss)
+        self.loops.sweep("train_ray", self.arrays, self.grid, batch, count, most, (grads, loss))
         self.collect(grads)
 
 
@@ -423,8 +420,9 @@ def unpack_bits(arrays: dict[str, np.ndarray], name: str, shape: list[int]) -> n
 
 def unpacked_bricks(marks: np.ndarray, mixed: np.ndarray | None, name: str, shape: list[int]) -> np.ndarray:
     """(X, Y, Z) bool of the bricks of a grid. Raises ValueError where they are not its."""
-    if np.prod(shape, dtype=float) > MOST_CELLS:
-        raise ValueError(f"array '{name}' is of {shape} cells, but at most {MOST_CELLS:,} are read")
+    most = 1 << 26
+    if np.prod(shape, dtype=float) > most:
+        raise ValueError(f"array '{name}' is of {shape} cells, but at most {most:,} are read")
     counts = [-(-n // BRICK) for n in shape]
     number = int(np.prod(counts))
     if marks.dtype != np.uint8 or marks.shape != (-(-number // 4),):

@@ -21,8 +21,6 @@ from platformdirs import user_cache_path
 from fusedrf_cli.engine.kernels import locator
 from fusedrf_cli.engine.kernels.threads import ONE_THREAD
 
-NOWHERE = Path(os.devnull, "kernels")
-
 
 def kernel_cache() -> Path:
     """The folder compiled kernels are kept in: the user's cache, or a temporary one where that cannot be
@@ -44,7 +42,7 @@ def kernel_cache() -> Path:
     try:
         return folder if ours else temporary_cache(digest)
     except OSError:
-        return NOWHERE
+        return Path(os.devnull, "kernels")
 
 
 def inlined() -> list[Path]:

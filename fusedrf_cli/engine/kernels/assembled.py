@@ -20,17 +20,8 @@ from fusedrf_cli.engine.kernels.primitives import LINE, sigmoid
 
 READS = {"density": "", "colour": "sigma", "sigma": "density", "rgb": "colour"}
 """Every slot, in the order of a field's numbers, and the slot that it reads."""
-HOOKS = (
-    "locate", "steps_at", "located", "is_inside", "pack_cell", "unpack_cell", "next_index", "forward",
-    "backward", "summed", "summed_backward", "logits", "logits_backward", "prefetch_at", "ray_setup",
-    "ray_backward",
-)  # fmt: skip
-"""What the loops below and other slots call; the rest of a module is reached from there."""
 BASE = "params", "lo", "side"
 """Fields of every assembly's Arrays: numbers (P,); corner (3,) and sides (3,) of the cube of `unit`."""
-OF_LOOPS = "KEPT", "LEARN_FROM", "SHADING_COST"  # constants that loops.py reads
-NOT_PREFIXED = {*BASE, "shape", "dtype", "type"}
-EDGE = 1e-9  # share of a box by which rounding may put a point on its face outside
 
 
 # -- what the loops ask of a kind ----------------------------------------------------------------------------
@@ -172,7 +163,8 @@ def locate(field, unit):
 def steps_at(field, cell, unit, index):
     """Every sample in the box stands for one step."""
     u, v, w = unit
-    return 1 if min(u, min(v, w)) >= -EDGE and max(u, max(v, w)) <= 1 + EDGE else 0
+    edge = 1e-9  # share of a box by which rounding may put a point on its face outside
+    return 1 if min(u, min(v, w)) >= -edge and max(u, max(v, w)) <= 1 + edge else 0
 
 
 def located(field, cell, scratch):
@@ -192,10 +184,14 @@ def no_ray_backward(field, d, scratch, grad):
     """Nothing is gathered for a ray."""
 
 
-DEFAULTS = {
-    f.__name__.removeprefix("no_"): f
-    for f in (locate, steps_at, located, logits_backward, no_ray_setup, no_ray_backward)
-}
+HOOKS = {
+    "locate": locate, "steps_at": steps_at, "located": located, "is_inside": None, "pack_cell": None,
+    "unpack_cell": None, "next_index": None, "forward": None, "backward": None, "summed": None,
+    "summed_backward": None, "logits": None, "logits_backward": logits_backward, "prefetch_at": None,
+    "ray_setup": no_ray_setup, "ray_backward": no_ray_backward,
+}  # fmt: skip
+"""What the loops above and other slots call, and what serves where a module leaves it out; the rest of a
+module is reached from there."""
 
 
 # -- one namespace of four slots -----------------------------------------------------------------------------
@@ -228,9 +224,9 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
 def slot_names(slot: str, module: ModuleType, read: ModuleType | None, assembly: ModuleType) -> dict:
     """What the functions of a slot need, by the name that it has in the one namespace."""
     names, fields = {}, set(arrays_of(module)._fields)
-    if fields & NOT_PREFIXED:
-        raise ValueError(f"'{module.__name__}' may not call its arrays {sorted(fields & NOT_PREFIXED)}")
-    hooks = {name: getattr(module, name, DEFAULTS.get(name)) for name in HOOKS}
+    if taken := fields & {*BASE, "shape", "dtype", "type"}:
+        raise ValueError(f"'{module.__name__}' may not call its arrays {sorted(taken)}")
+    hooks = {name: getattr(module, name, default) for name, default in HOOKS.items()}
     pending = {name: hook for name, hook in hooks.items() if hook is not None}
     known_as = dict(pending)
     while pending:
@@ -293,9 +289,10 @@ def constants(field) -> dict[str, int | float]:
     """The constants of a field's namespace by name: those of each slot (engine/fields/assembled.py) with its
     prefix, and AT, where its ROOM numbers of scratch begin, on a cache line."""
     named, start = {}, 0
+    of_loops = "KEPT", "LEARN_FROM", "SHADING_COST"  # which loops.py reads
     for slot, filled in field.slots.items():
         slot_sizes = filled.sizes
-        named |= {name if name in OF_LOOPS else f"{slot}_{name}": value for name, value in slot_sizes.items()}
+        named |= {name if name in of_loops else f"{slot}_{name}": value for name, value in slot_sizes.items()}
         named[f"{slot}_AT"] = start
         start += -(-slot_sizes.get("ROOM", 0) // LINE) * LINE
     return {"KEPT": 0, **named, "SCRATCH": start}

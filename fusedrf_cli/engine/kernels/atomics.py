@@ -8,9 +8,6 @@ from numba.cuda.extending import intrinsic
 from numba.cuda.np import arrayobj
 from numba.cuda.nvvmutils import declare_atomic_add_float32, declare_atomic_add_float64
 
-VECTORS_FROM = 9, 0  # compute capability that has `red.v4.f32` (PTX ISA 8.1)
-VECTOR = "{ .reg .u64 at; cvta.to.global.u64 at, $0; red.global.add.v4.f32 [at], {$1, $2, $3, $4}; }"
-
 
 @intrinsic
 def add_4(typingctx, out, o, e0, e1, e2, e3):
@@ -23,9 +20,13 @@ def add_4(typingctx, out, o, e0, e1, e2, e3):
         start = cgutils.get_item_pointer(
             context, builder, array_type, array, [arguments[1]], wraparound=False, boundscheck=False
         )
-        if array_type.dtype == types.float32 and ConfigStack().top().compute_capability >= VECTORS_FROM:
+        newer = ConfigStack().top().compute_capability >= (9, 0)  # has `red.v4.f32` (PTX ISA 8.1)
+        if array_type.dtype == types.float32 and newer:
+            vector = (
+                "{ .reg .u64 at; cvta.to.global.u64 at, $0; red.global.add.v4.f32 [at], {$1, $2, $3, $4}; }"
+            )
             kinds = ir.FunctionType(ir.VoidType(), [start.type, *[ir.FloatType()] * 4])
-            add = ir.InlineAsm(kinds, VECTOR, "l,f,f,f,f,~{memory}", side_effect=True)
+            add = ir.InlineAsm(kinds, vector, "l,f,f,f,f,~{memory}", side_effect=True)
             builder.call(add, [start, *arguments[2:]])
         else:
             single = array_type.dtype == types.float32

@@ -16,7 +16,8 @@ from numba.core import event
 from numba.np.numpy_support import from_dtype
 
 from fusedrf_cli.engine.kernels import primitives, specialise
-from fusedrf_cli.engine.kernels.loops import POINTS_PER_TASK, RaySamples
+from fusedrf_cli.engine.kernels.learning import RaySamples
+from fusedrf_cli.engine.kernels.loops import POINTS_PER_TASK
 from fusedrf_cli.engine.settings import current
 
 SIMULATED = bool(numba.config.ENABLE_CUDASIM)
@@ -31,6 +32,8 @@ class CudaConfig:
     """Rays of a training pass that have scratch memory at the same time."""
     points_in_flight: int = 1 << 18
     """The same of points."""
+    near_in_flight: int = 1 << 22
+    """Numbers of instances that rays may meet: in each of four arrays of 32 MB."""
 
 
 if not SIMULATED:  # whose compiler has settings of its own
@@ -110,12 +113,6 @@ def literally(value):
     return value
 
 
-REPLACED = {
-    "accumulate": accumulate, "raise_to": raise_to, "scatter_4": scatter_4, "scatter_8": scatter_8,
-    "prefetch_density": ahead, "prefetch_colour": ahead, "literally": literally,
-}  # fmt: skip
-
-
 def as_device_functions(names: dict) -> dict:
     """The namespace with every function in it, compiled for the CPU or not at all, as one of the device."""
     device_names = dict(names)
@@ -125,7 +122,10 @@ def as_device_functions(names: dict) -> dict:
             device_names[name] = device(
                 FunctionType(function.__code__, device_names, name, function.__defaults__)
             )
-    device_names.update(REPLACED)
+    device_names |= {
+        "accumulate": accumulate, "raise_to": raise_to, "scatter_4": scatter_4, "scatter_8": scatter_8,
+        "prefetch_density": ahead, "prefetch_colour": ahead, "literally": literally,
+    }  # fmt: skip
     return device_names
 
 
@@ -142,8 +142,9 @@ class Loops:
         """See specialise.Loops."""
         launch(self._kernel(each_thread, item, field), count, (field, grid, query, count), (out,))
 
-    def sweep(self, item: str, field, grid, batch, count: int, most: int, grads, loss):
-        """See specialise.Loops; all is added to row 0 of grads and loss."""
+    def sweep(self, item: str, field, grid, batch, count: int, most: int, out):
+        """See specialise.Loops; all is added to row 0 of both."""
+        grads, loss = out
         config = current(CudaConfig)
         kernel = self._kernel(sweep_thread, item, field)
         # as much for few rays as for many: their number changes from step to step, and memory is slow to be

@@ -8,20 +8,19 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 from numba import cuda
 
-from fusedrf_cli.engine.kernels import segments, specialise
-from fusedrf_cli.engine.kernels.cuda import as_device_functions, device, kernel_of, launch
+from fusedrf_cli.engine.kernels import bundles, segments, specialise
+from fusedrf_cli.engine.kernels.bundles import RayBatch
+from fusedrf_cli.engine.kernels.cuda import CudaConfig, as_device_functions, device, kernel_of, launch
 from fusedrf_cli.engine.kernels.segments import (
     Groups,
-    RayBatch,
     Segments,
     goes_on,
     merge_task,
     next_in_any,
     segment_task,
 )
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, unbounded
-
-NEAR_AT_ONCE = 1 << 22  # numbers of instances that rays may meet: in each of four arrays of 32 MB
 
 
 @cache
@@ -34,8 +33,8 @@ def ray_kernels(spaces: tuple[ModuleType, ...] = ()) -> SimpleNamespace:
     in_space = next_in_any([own[s]["next_change"] for s in spaces or (unbounded,)], tag, device)
     kernels = {"next_in_box": own[bounded]["next_change"], "next_in_space": in_space}
     kernels["ray_in_instance"] = own[bounded]["ray_in_instance"]
-    plain = {name: value for name, value in vars(segments).items() if name not in kernels}
-    names = as_device_functions(plain)
+    plain = {**vars(bundles), **vars(segments)}
+    names = as_device_functions({name: value for name, value in plain.items() if name not in kernels})
     names |= kernels | {"cuda": cuda}
     templates = near_thread, merge_thread, add_thread, left_thread
     return SimpleNamespace(**{t.__name__: kernel_of(t, names, tag) for t in templates})
@@ -83,7 +82,7 @@ def next_segments(
 ) -> None:
     """See segments.py."""
     count = len(instances.step)
-    threads = max(1, min(len(chosen), NEAR_AT_ONCE // count))
+    threads = max(1, min(len(chosen), current(CudaConfig).near_in_flight // count))
     room = [cuda.device_array((threads, count), kind) for kind in (np.int64, np.float64) * 2]
     launch(ray_kernels(spaces).near_thread, threads, (rays, instances, chosen, *room), (segments,))
 

@@ -8,15 +8,9 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from fusedrf_cli.engine.kernels.lens import lens_ray, unbend
 from fusedrf_cli.engine.kernels.prefetch import prefetch
-from fusedrf_cli.engine.kernels.primitives import (
-    LINE,
-    adam_line,
-    lens_ray,
-    sum_of_rows,
-    touched,
-    unbend,
-)  # fmt: skip
+from fusedrf_cli.engine.kernels.primitives import LINE, adam_line, sum_of_rows, touched
 from fusedrf_cli.engine.kernels.threads import ONE_THREAD
 
 FLAGS = dict(fastmath=True, error_model="numpy", cache=True)
@@ -26,10 +20,8 @@ loop = njit(**FLAGS, parallel=not ONE_THREAD, nogil=True)
 # eight times faster, so tasks allocate nothing: the loops around them hand in the scratch.
 serial = njit(**FLAGS, _nrt=False)
 
-RAYS_PER_TASK = 2048
-ENTRIES_PER_TASK = 1 << 16
-LINES_PER_TASK = ENTRIES_PER_TASK // LINE
-LINES_AHEAD = 8  # a line's moments are asked for so many lines before it
+ITEMS_PER_TASK = 2048
+LINES_PER_TASK = (1 << 16) // LINE
 
 
 @serial
@@ -59,7 +51,7 @@ def adam_task(
     """`adam` for the cache lines that begin at starts[:count]. What only they need is asked for early: which
     they are follows no pattern, so that each would be waited for."""
     for i in range(count):
-        ahead = starts[min(i + LINES_AHEAD, count - 1)]
+        ahead = starts[min(i + 8, count - 1)]
         prefetch(params, ahead)
         if moment1.shape[0] != 0:
             prefetch(moment1, ahead)
@@ -78,10 +70,11 @@ def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, co
     An entry whose gradient is exactly 0 was touched by no sample: it and its moments keep their values (lazy
     Adam). moment1 (0,) stands for β1 = 0.
     """
-    for part in prange((high - low + ENTRIES_PER_TASK - 1) // ENTRIES_PER_TASK):
-        start = low + part * ENTRIES_PER_TASK
+    per_task = LINES_PER_TASK * LINE
+    for part in prange((high - low + per_task - 1) // per_task):
+        start = low + part * per_task
         starts = np.empty(LINES_PER_TASK, np.int64)
-        count = touched_of_all(grads, start, min(high, start + ENTRIES_PER_TASK), starts)
+        count = touched_of_all(grads, start, min(high, start + per_task), starts)
         adam_task(
             params, grads, moment1, moment2, rate, starts, count, beta1, beta2, eps, correction1, correction2
         )
@@ -111,10 +104,10 @@ def lens_task(pose, fl_x, fl_y, cx, cy, distortion, bent, width, top, order, low
 def lens_rays(pose, fl_x, fl_y, cx, cy, distortion, bent, width, top, order, rays_o, rays_d):
     """Rays (N, 3) of a camera at pose (4, 4), camera to world, OpenGL axes: ray i is that of pixel order[i]
     (N,), counted row by row of `width` pixels from row `top` on. The lens is a pinhole or, where it is
-    `bent`, has a `distortion`, a tuple of nine (`primitives.bend`)."""
+    `bent`, has a `distortion`, a tuple of nine (`lens.bend`)."""
     n = order.shape[0]
-    for part in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
-        low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
+    for part in prange((n + ITEMS_PER_TASK - 1) // ITEMS_PER_TASK):
+        low, high = part * ITEMS_PER_TASK, min(n, (part + 1) * ITEMS_PER_TASK)
         lens_task(pose, fl_x, fl_y, cx, cy, distortion, bent, width, top, order, low, high, rays_o, rays_d)
 
 
@@ -127,11 +120,11 @@ def unbend_task(distorted, distortion, low, high, ideal):
 
 @loop
 def unbent(distorted, distortion, ideal):
-    """For every of distorted (N, 2) normalised image coordinates the ideal ones (`primitives.unbend`), by a
+    """For every of distorted (N, 2) normalised image coordinates the ideal ones (`lens.unbend`), by a
     lens of `distortion`, a tuple of nine."""
     n = distorted.shape[0]
-    for part in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
-        low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
+    for part in prange((n + ITEMS_PER_TASK - 1) // ITEMS_PER_TASK):
+        low, high = part * ITEMS_PER_TASK, min(n, (part + 1) * ITEMS_PER_TASK)
         unbend_task(distorted, distortion, low, high, ideal)
 
 

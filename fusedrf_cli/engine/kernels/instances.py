@@ -19,10 +19,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusedrf_cli.engine.kernels.primitives import FACE_TOLERANCE, along, cell_of, exit_distance, next_sample
+from fusedrf_cli.engine.kernels.primitives import (
+    FACE_TOLERANCE,
+    FARTHEST,
+    along,
+    cell_of,
+    exit_distance,
+    next_sample,
+)
 
 MAX_TRACED = 24  # samples of a slot: what does not fit is left to the ray's next segment
-FARTHEST = 1e30  # farther than any ray goes
 ANYWHERE = -1.0  # for a gap: where occupied cells begin
 DENSER = 1 + 1e-6  # times as dense at least, to be denser: else the first instance shows, not a rounding
 

@@ -16,7 +16,6 @@ from numba.core import caching
 from numba.core.caching import CacheImpl, UserProvidedCacheLocator
 
 PACKAGE = Path(__file__).parents[2]
-DIGEST = hashlib.sha256().digest_size
 
 
 class PackageLocator(UserProvidedCacheLocator):
@@ -62,10 +61,11 @@ class KernelStore:
             content = self.path(key).read_bytes()
         except OSError:
             return None
-        if hashlib.sha256(content[DIGEST:]).digest() != content[:DIGEST]:
+        size = hashlib.sha256().digest_size
+        if hashlib.sha256(content[size:]).digest() != content[:size]:
             self.say("damaged", f"compiled kernels in {self.folder} are damaged; they are compiled again")
             return None
-        made_of, saved_key, data = pickle.loads(content[DIGEST:])
+        made_of, saved_key, data = pickle.loads(content[size:])
         return data if (made_of, saved_key) == (self.made_of, key) else None
 
     def save(self, key: object, data: object) -> None:

@@ -5,14 +5,12 @@ import math
 import numpy as np
 from numba import prange
 
-from fusedrf_cli.engine.kernels.field_free import loop, serial
+from fusedrf_cli.engine.kernels.field_free import ITEMS_PER_TASK, loop, serial
+from fusedrf_cli.engine.kernels.loops import RAYS_PER_TASK
 from fusedrf_cli.engine.kernels.prefetch import prefetch
 from fusedrf_cli.engine.kernels.primitives import device
 
-RAYS_PER_TASK = 256
-NUMBERS_PER_TASK = 2048
 ROUNDS = 6  # of mixing
-LEAST_BITS = 8  # by which an order is told: by fewer, some orders of a few numbers came far more often
 AHEAD = 8  # so many rays before it is used a pixel is asked for, which lies anywhere
 
 
@@ -57,13 +55,13 @@ def shuffled(at, count, keys, out):
     An order of more numbers, a power of two, is gone along from each place until a number below `count` comes
     (cycle walking: Black and Rogaway 2002, "Ciphers with Arbitrary Finite Domains", section 3).
     """
-    bits = LEAST_BITS
+    bits = 8  # at least: by fewer, some orders of a few numbers came far more often
     while (1 << bits) < count:
         bits += 1
     low_bits, high_bits = np.uint64(bits // 2), np.uint64(bits - bits // 2)
     n = out.shape[0]
-    for part in prange((n + NUMBERS_PER_TASK - 1) // NUMBERS_PER_TASK):
-        low, high = part * NUMBERS_PER_TASK, min(n, (part + 1) * NUMBERS_PER_TASK)
+    for part in prange((n + ITEMS_PER_TASK - 1) // ITEMS_PER_TASK):
+        low, high = part * ITEMS_PER_TASK, min(n, (part + 1) * ITEMS_PER_TASK)
         shuffled_task(at, count, low_bits, high_bits, keys, low, high, out)
 
 

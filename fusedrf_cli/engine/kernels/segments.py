@@ -10,26 +10,15 @@ from typing import NamedTuple
 import numpy as np
 from numba import get_num_threads, prange
 
+from fusedrf_cli.engine.kernels.bundles import fewer_near, instances_near, ray_reaches
 from fusedrf_cli.engine.kernels.field_free import loop, serial
-from fusedrf_cli.engine.kernels.instances import ANYWHERE, DENSER, FARTHEST
-from fusedrf_cli.engine.kernels.primitives import along, device
+from fusedrf_cli.engine.kernels.instances import ANYWHERE, DENSER
+from fusedrf_cli.engine.kernels.primitives import FARTHEST, device
 from fusedrf_cli.engine.kernels.specialise import inlined, loops_for, rebound
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
-TILE, FEW = 256, 16  # rays, which lie close together in pictures
-PER_TASK = 1024
 GAP = 4.0  # steps: occupied cells that are no farther apart belong together
-ROUNDING = 1e-6  # of angles, in radians, and of distances, by which rays may come nearer than is reckoned
-TIED = 1e-12  # of a distance, by which is looked farther for what begins where another does
 DONE, SHARED = -1, -2  # of a ray's segment: there is none; several instances meet in it
-
-
-class RayBatch(NamedTuple):
-    """N rays in the scene's frame."""
-
-    rays_o: object  # (N, 3) float64
-    rays_d: object  # (N, 3) float64, unit length
-    reach: object  # (N, 2) float64, from which distance to which they are followed
 
 
 class Segments(NamedTuple):
@@ -56,103 +45,6 @@ class Groups(NamedTuple):
 
 next_in_box, next_in_space = (loops_for(None, (), s).names["next_change"] for s in (bounded, unbounded))
 ray_in_instance = loops_for(None, (), bounded).names["ray_in_instance"]
-
-
-# -- which instances a ray may meet --------------------------------------------------------------------------
-
-
-@device
-def bundle_of(rays, chosen, low, high):
-    """A cone that holds the directions of rays chosen[low:high], and a ball that holds their origins: centre,
-    radius, axis, and sine and cosine of half its angle."""
-    rays_o, rays_d, r = rays.rays_o, rays.rays_d, chosen[low]
-    x, y, z = rays_o[r, 0], rays_o[r, 1], rays_o[r, 2]
-    dx, dy, dz, wide = 0.0, 0.0, 0.0, 0.0
-    for i in range(low, high):
-        r = chosen[i]
-        dx, dy, dz = dx + rays_d[r, 0], dy + rays_d[r, 1], dz + rays_d[r, 2]
-        ox, oy, oz = rays_o[r, 0] - x, rays_o[r, 1] - y, rays_o[r, 2] - z
-        wide = max(wide, ox * ox + oy * oy + oz * oz)
-    length, least = math.sqrt(dx * dx + dy * dy + dz * dz), 1.0
-    if length <= 0.0:
-        return (x, y, z), math.sqrt(wide), (1.0, 0.0, 0.0), (0.0, -1.0)
-    dx, dy, dz = dx / length, dy / length, dz / length
-    for i in range(low, high):
-        r = chosen[i]
-        least = min(least, rays_d[r, 0] * dx + rays_d[r, 1] * dy + rays_d[r, 2] * dz)
-    least = max(least, -1.0)
-    return (x, y, z), math.sqrt(wide), (dx, dy, dz), (math.sqrt(max(1.0 - least * least, 0.0)), least)
-
-
-@device
-def bundle_reaches(bundle, sphere):
-    """From which distance on a ray of a bundle, see `bundle_of`, may be in a sphere (centre and radius), or
-    FARTHEST where none comes there: a sphere is reached whose centre is no farther from the cone than its
-    radius."""
-    centre, wide, axis, (sine, cosine) = bundle
-    x, y, z = sphere[0] - centre[0], sphere[1] - centre[1], sphere[2] - centre[2]
-    square, radius = x * x + y * y + z * z, sphere[3] + wide
-    far, along_axis = math.sqrt(square), x * axis[0] + y * axis[1] + z * axis[2]
-    aside = math.sqrt(max(square - along_axis * along_axis, 0.0))
-    if cosine > 0.0 and aside * cosine - along_axis * sine > radius + ROUNDING * far:
-        return FARTHEST
-    return far * (1 - ROUNDING) - radius
-
-
-@device
-def ray_reaches(rays, r, sphere, begin, end):
-    """Whether ray r comes into a sphere (centre and radius) between two distances."""
-    x, y, z = sphere[0] - rays.rays_o[r, 0], sphere[1] - rays.rays_o[r, 1], sphere[2] - rays.rays_o[r, 2]
-    d = rays.rays_d[r, 0], rays.rays_d[r, 1], rays.rays_d[r, 2]
-    middle = x * d[0] + y * d[1] + z * d[2]
-    x, y, z = along((x, y, z), d, -middle)  # past the centre: exact however far away that is
-    passes = x * x + y * y + z * z <= sphere[3] * sphere[3]
-    return passes and middle + sphere[3] >= begin and middle - sphere[3] < end
-
-
-@device
-def instances_near(rays, instances, chosen, low, high, near, begins):
-    """The instances that rays chosen[low:high] may meet into near (B,), unbounded ones first, the others by
-    where they may begin, which goes into begins (B,): how many are unbounded, and how many there are."""
-    bundle, count = bundle_of(rays, chosen, low, high), 0
-    for b in range(instances.step.shape[0]):
-        if instances.spheres[b, 3] >= FARTHEST:
-            near[count], begins[count] = b, -FARTHEST
-            count += 1
-    n_unbounded = count
-    for b in range(instances.step.shape[0]):
-        if instances.spheres[b, 3] < FARTHEST:
-            at = bundle_reaches(bundle, instances.spheres[b])
-            if at < FARTHEST:
-                near[count], begins[count] = b, at
-                count += 1
-    sort_by(begins, near, n_unbounded, count)
-    return n_unbounded, count
-
-
-@device
-def fewer_near(rays, instances, chosen, low, high, near, begins, count, few, few_begin):
-    """Those of instances near[:count] that rays chosen[low:high], some of those that they are near to, may
-    meet, in the same order, into few (B,) and few_begin (B,): how many."""
-    bundle, left = bundle_of(rays, chosen, low, high), 0
-    for c in range(count):
-        unbounded = begins[c] <= -FARTHEST
-        if unbounded or bundle_reaches(bundle, instances.spheres[near[c]]) < FARTHEST:
-            few[left], few_begin[left] = near[c], begins[c]
-            left += 1
-    return left
-
-
-@device
-def sort_by(keys, values, low, high):
-    """Order keys[low:high], and values with them, by Shell's method with Ciura's gaps."""
-    for gap in (701, 301, 132, 57, 23, 10, 4, 1):
-        for i in range(low + gap, high):
-            key, value, j = keys[i], values[i], i
-            while j - gap >= low and keys[j - gap] > key:
-                keys[j], values[j] = keys[j - gap], values[j - gap]
-                j -= gap
-            keys[j], values[j] = key, value
 
 
 # -- the next segment of a ray -------------------------------------------------------------------------------
@@ -184,7 +76,7 @@ def first_two(rays, instances, r, near, begins, low, high, begin, two):
     Of those that begin at one place, as all do in which the ray is already, the ones of the lowest numbers
     come first, whatever order they are in."""
     for c in range(low, high):
-        end = two[1] + TIED * abs(two[1])
+        end = two[1] + 1e-12 * abs(two[1])  # farther by a rounding, for what begins where another does
         if begins[c] > end:
             break
         b = near[c]
@@ -251,8 +143,9 @@ def segment_of(rays, instances, r, near, begins, n_unbounded, count, segments):
 def segment_task(rays, instances, chosen, low, high, near, begins, few, few_begin, segments):
     """`next_segments` of rays chosen[low:high]; near, begins, few and few_begin (B,) are room."""
     n_unbounded, count = instances_near(rays, instances, chosen, low, high, near, begins)
-    for start in range(low, high, FEW):
-        stop = min(high, start + FEW)
+    few_rays = 16  # which lie close together in pictures
+    for start in range(low, high, few_rays):
+        stop = min(high, start + few_rays)
         left = fewer_near(rays, instances, chosen, start, stop, near, begins, count, few, few_begin)
         for i in range(start, stop):
             segment_of(rays, instances, chosen[i], few, few_begin, n_unbounded, left, segments)
@@ -268,11 +161,12 @@ def next_segments(rays, instances, spaces, chosen, segments):
 def segments_loop(rays, instances, chosen, threads, segments):
     """`next_segments` by so many threads."""
     n = chosen.shape[0]
-    tasks = (n + TILE - 1) // TILE
+    tile = 256  # rays, which lie close together in pictures
+    tasks = (n + tile - 1) // tile
     each_has = (tasks + threads - 1) // threads
     for turn in prange(each_has * threads):
         part = turn % each_has * threads + turn // each_has
-        low, high = part * TILE, min(n, (part + 1) * TILE)
+        low, high = part * tile, min(n, (part + 1) * tile)
         if low < high:
             count = instances.step.shape[0]
             near, few = np.empty(count, np.int64), np.empty(count, np.int64)
@@ -459,9 +353,9 @@ def merge_samples(shared, start, early_stop, groups, traces, segment_end, out):
     """Composite the samples of rays shared (M,), slots start[m] to start[m + 1] of the m-th, as piecewise
     constant densities behind what out (N, 5) has. Leaves in traces.weight what each takes of the light, and
     in segment_end (N,) how far that went."""
-    m = shared.shape[0]
-    for part in prange((m + PER_TASK - 1) // PER_TASK):
-        low, high = part * PER_TASK, min(m, (part + 1) * PER_TASK)
+    m, per_task = shared.shape[0], 1024
+    for part in prange((m + per_task - 1) // per_task):
+        low, high = part * per_task, min(m, (part + 1) * per_task)
         merge_task(shared, start, low, high, early_stop, groups, traces, segment_end, out)
 
 

@@ -13,7 +13,7 @@ from types import FunctionType, ModuleType
 
 from numba import get_num_threads, njit
 
-from fusedrf_cli.engine.kernels import instances, light, loops, primitives
+from fusedrf_cli.engine.kernels import instances, learning, light, loops, primitives
 from fusedrf_cli.engine.kernels.field_free import FLAGS, loop, serial
 
 ROLES = {"each": loop, "sweep": loop, "march": loop, "each_task": serial, "sweep_task": serial}
@@ -32,10 +32,10 @@ class Loops:
         """An item of work, a function of loops.py or of the kind, for each i < count, which fills `out`."""
         self._over("each", item)(field, grid, query, count, per_task, get_num_threads(), out)
 
-    def sweep(self, item: str, field, grid, batch, count: int, most: int, grads, loss):
-        """An item of work of at most so many samples for each i < count, which adds to the rows of grads
-        (parts, P) and of loss (parts, 3)."""
-        self._over("sweep", item)(field, grid, batch, count, most, grads, loss)
+    def sweep(self, item: str, field, grid, batch, count: int, most: int, out):
+        """An item of work of at most so many samples for each i < count, which adds to the rows of out:
+        (grads (parts, P), loss (parts, 3))."""
+        self._over("sweep", item)(field, grid, batch, count, most, *out)
 
     def march(self, *arguments):
         """See `march` of loops.py."""
@@ -78,7 +78,8 @@ def specialised(
 
 def namespace(device_module: ModuleType | None, space: ModuleType) -> tuple[dict, dict[str, FunctionType]]:
     """What the names mean before anything is compiled, and which of them are plain functions to compile."""
-    modules = [loops, instances, light, *bases_of(space), space, *([device_module] if device_module else ())]
+    own = [device_module] if device_module else []
+    modules = [loops, learning, instances, light, *bases_of(space), space, *own]
     names = {name: value for module in (primitives, *modules) for name, value in vars(module).items()}
     module_names = {module.__name__ for module in modules}
     functions = {

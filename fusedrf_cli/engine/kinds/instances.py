@@ -47,9 +47,6 @@ class InstancesConfig:
     """What was finished at 16 bits is surpassed by twice the numbers at 8."""
 
 
-FLOAT = 4
-
-
 class InstancesKind(Kind):
     """A way of fusing whose fields are of any kinds."""
 
@@ -249,7 +246,7 @@ class InstancesBuilder(DirectBuilder):
     def needs(self) -> MemoryEstimate:
         """The sources' numbers as far as the limit lets them."""
         request, per_number = self.request, self.request.sizes.per_number
-        own = sum(request.source_bytes) // FLOAT
+        own = sum(request.source_bytes) // 4  # bytes
         cheapest = request.precision or self.kind.precisions[0]
         return MemoryEstimate(
             min(own, int(request.limit / per_number(cheapest))), current(InstancesConfig).copies

@@ -1,5 +1,5 @@
 """Finds the kinds of field: each is a folder beside this file, or one of WAYS, or comes from another package
-by an entry point of the group GROUP, and says what it is in an object named KIND.
+by an entry point of the group fusedrf.kinds, and says what it is in an object named KIND.
 
 Names are found without importing anything, for `--help`; a kind is imported when it is used.
 """
@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from fusedrf_cli.engine.kinds.kind import Kind
 
-GROUP = "fusedrf.kinds"
 AUTO = "auto"  # the name under which a kind is chosen by what the kinds say of a scene
 INSTANCES = "blocks"  # the name under which nothing is learnt: every source stays a field of its own
 WAYS = {INSTANCES: f"{__package__}.instances"}
@@ -41,7 +40,7 @@ def plugged_in() -> dict[str, EntryPoint]:
     """Names of the kinds of other packages. Where two packages offer the same name the first is taken, and a
     name of our own is never replaced."""
     by_name: dict[str, EntryPoint] = {}
-    for point in entry_points(group=GROUP):
+    for point in entry_points(group="fusedrf.kinds"):
         if point.name not in own_kinds():
             by_name.setdefault(point.name, point)
     return by_name

@@ -56,9 +56,6 @@ class ResampledConfig:
     """Of opacity per voxel from which a vertex is seen from one side."""
 
 
-FLOAT = 4.0  # bytes
-
-
 @dataclass(frozen=True)
 class GridVertices:
     """The used vertices of a field over one box; see `Vertices`."""
@@ -223,6 +220,6 @@ class ResampledBuilder(DirectBuilder, GridBuilder):
             numbers = max(numbers, self.kind.numbers(plan.storage, lattice.resolution))
         making = {
             "vertices while they are asked": config.per_vertex * vertices,
-            "what it starts as": FLOAT * numbers,
+            "what it starts as": 4.0 * numbers,
         }
         return MemoryEstimate(numbers, making=making, points=0)

@@ -10,8 +10,8 @@ from functools import lru_cache
 import numpy as np
 
 from fusedrf_cli.engine.kernels import cpu
-from fusedrf_cli.engine.kernels.primitives import NEWTON_NEAR, NEWTON_STEPS
-from fusedrf_cli.engine.kernels.primitives import bend as bend_numbers
+from fusedrf_cli.engine.kernels.lens import NEWTON_NEAR, NEWTON_STEPS
+from fusedrf_cli.engine.kernels.lens import bend as bend_numbers
 from fusedrf_cli.engine.settings import current
 
 TILE = 16  # pixels along the side of a tile
@@ -31,7 +31,7 @@ class Camera:
     width: int
     height: int
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, k3, p1, p2 and, where there are more, k4, d1, d2, d3 (see `primitives.bend`); of a fisheye k1,
+    """k1, k2, k3, p1, p2 and, where there are more, k4, d1, d2, d3 (see `lens.bend`); of a fisheye k1,
     k2, k3, k4 (see `bend_angle`)."""
     name: str = ""
     fisheye: bool = False
@@ -96,7 +96,7 @@ def tile_order(width: int, rows: int) -> np.ndarray:
 
 
 def undistort(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Invert `primitives.bend`: distorted to ideal normalised image coordinates (y down). A pixel that no
+    """Invert `lens.bend`: distorted to ideal normalised image coordinates (y down). A pixel that no
     ray reaches gets the nearest that was found."""
     ideal = np.empty((np.size(x), 2))
     cpu.unbent(np.stack([np.ravel(x), np.ravel(y)], 1), of_nine(distortion), ideal)
@@ -104,7 +104,7 @@ def undistort(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> tu
 
 
 def of_nine(distortion: tuple[float, ...]) -> tuple[float, ...]:
-    """A lens's numbers as `primitives.bend` takes them."""
+    """A lens's numbers as `lens.bend` takes them."""
     return tuple(map(float, distortion)) + (0.0,) * (9 - len(distortion))
 
 

@@ -47,8 +47,8 @@ class RenderedImage:
     depth: np.ndarray
     """(H, W) mean distance along the ray in world units; inf where nothing is hit."""
 
-    def over(self, background: tuple[float, float, float]) -> np.ndarray:
-        """(H, W, 3) composited over a colour, in [0, 1]."""
+    def over(self, background: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> np.ndarray:
+        """(H, W, 3) composited over a colour, by default white, in [0, 1]."""
         return np.clip(self.rgb + (1 - self.opacity[..., None]) * np.asarray(background, np.float32), 0, 1)
 
 

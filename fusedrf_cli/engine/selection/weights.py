@@ -7,8 +7,10 @@ from fusedrf_cli.engine.composition.composite import Composite, Waves
 from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.fields.computed import exact
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, mapped
-from fusedrf_cli.engine.kernels.instances import FARTHEST, Traces
-from fusedrf_cli.engine.kernels.segments import DONE, RayBatch
+from fusedrf_cli.engine.kernels.bundles import RayBatch
+from fusedrf_cli.engine.kernels.instances import Traces
+from fusedrf_cli.engine.kernels.primitives import FARTHEST
+from fusedrf_cli.engine.kernels.segments import DONE
 from fusedrf_cli.engine.rendering.volume import RenderConfig, reach_of, waves, weights_from_depths
 from fusedrf_cli.engine.settings import current
 

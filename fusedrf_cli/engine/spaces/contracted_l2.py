@@ -12,7 +12,7 @@ import math
 
 import torch
 
-from fusedrf_cli.engine.kernels.primitives import along
+from fusedrf_cli.engine.kernels.primitives import FARTHEST, along
 from fusedrf_cli.engine.spaces.curved import (  # noqa: F401
     CONSTANTS,
     CONTRACTED_DENSITY,
@@ -34,7 +34,6 @@ from fusedrf_cli.engine.spaces.curved import (  # noqa: F401
     size_before,
 )
 from fusedrf_cli.engine.spaces.unbounded import (  # noqa: F401
-    ENDLESS,
     FAR,
     LEARN_FROM,
     LOOK_AT_BOX,
@@ -46,7 +45,6 @@ from fusedrf_cli.engine.spaces.unbounded import (  # noqa: F401
 
 PIECES = 3  # up to the ball, or to where the ray is nearest to the origin; in the ball; behind it
 INWARDS, INSIDE, OUTWARDS, BEYOND = 0, 1, 2, 3  # regions of a ray, in order
-CLOSEST = 1e-9  # b at least
 
 
 def size_of(p):
@@ -69,7 +67,7 @@ def nearest(o, d):
     and where in τ the unit ball and the ball of radius FAR end, 0 where it does not come there."""
     speed = size_of(d)
     middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / (speed * speed)
-    b = max(size_of(along(o, d, middle)), CLOSEST)
+    b = max(size_of(along(o, d, middle)), 1e-9)  # which is divided by
     return middle, b, speed, math.sqrt(max(1.0 - b * b, 0.0)), math.sqrt(max(FAR * FAR - b * b, 0.0))
 
 
@@ -88,7 +86,7 @@ def next_piece(piece_begin, grid, o, d, far):
     low = -last if region == INWARDS else (-edge if region == INSIDE else edge)
     high = -edge if region == INWARDS else (edge if region == INSIDE else last)
     following = max(middle + high / speed, t0), min(region + 1, BEYOND)
-    low, high = max((t0 - middle) * speed, low), min((min(far, ENDLESS) - middle) * speed, high)
+    low, high = max((t0 - middle) * speed, low), min((min(far, FARTHEST) - middle) * speed, high)
     per, length = 0.0, high - low
     if region != INSIDE:
         per = b / math.sqrt(SHELL * SHELL + (1.0 + SHELL) * (1.0 + SHELL) * b * b)

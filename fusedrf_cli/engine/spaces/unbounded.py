@@ -18,12 +18,11 @@ import math
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.kernels.primitives import along, hit_box
+from fusedrf_cli.engine.kernels.primitives import FARTHEST, along, hit_box
 
 PIECES = 6  # a straight line meets at most five of the seven regions, and a sixth by rounding at an edge
 STEP_PER_VOXEL = 0.9  # at most: a step of half a voxel shows the same (decision 001) in 1.5 times the time
 FAR = 1e3  # n at which rays end
-ENDLESS = 1e30
 CORE, NOWHERE = 0, -1  # regions; 1 + 2 axis is the slab on the negative side of an axis, 2 + 2 axis the other
 REACH = 2.0  # coordinates lie between -REACH and REACH
 # See loops.py: a ray through a place has some hundred samples that weigh next to nothing.
@@ -98,7 +97,7 @@ def size_in(region, p):
 
 def leaving(region, o, d, t):
     """Where a ray that is in a region at t leaves it, and the region that it enters there."""
-    end, after = ENDLESS, NOWHERE
+    end, after = FARTHEST, NOWHERE
     if region == CORE:
         for side in range(1, 7):
             speed = size_in(side, d)

@@ -9,6 +9,8 @@ from fusedrf_cli.engine.distillation.teacher import TeacherConfig, query_teacher
 from fusedrf_cli.engine.rendering.volume import RenderConfig, render_rays
 from tests.engine.conftest import BOX, Gaussian, Slab
 
+EVERYTHING = TeacherConfig(empty_share=1.0)
+
 
 def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
@@ -29,10 +31,10 @@ def test_pixels_are_those_of_the_renderer(in_force):
 
 @pytest.mark.parametrize("at_once", [1 << 14, 30])
 def test_points_are_samples_with_the_teachers_answers(at_once, in_force):
-    in_force(RenderConfig(rays_at_once=at_once))
+    in_force(RenderConfig(rays_at_once=at_once), EVERYTHING)
     field = Gaussian(density=8.0)
     rays_o, rays_d = RaySampler([BOX]).draw(100, seeded())
-    points = query_teacher(field, rays_o, rays_d, 0.05, seeded(3), everything).points
+    points = query_teacher(field, rays_o, rays_d, 0.05, seeded(3)).points
     sigma, rgb = field.query(points.where, points.dirs)
     assert len(points) > 1000 and (sigma < 1e-3).any() and (sigma > 1).any()
     torch.testing.assert_close(sigma, points.sigma, rtol=1e-4, atol=1e-6)  # places are kept in float32
@@ -40,23 +42,21 @@ def test_points_are_samples_with_the_teachers_answers(at_once, in_force):
     torch.testing.assert_close(rgb[shown], points.rgb[shown], rtol=1e-4, atol=1e-5)
 
 
-def everything(depth, transmittance):
-    return torch.ones_like(depth)
-
-
-def test_all_matter_is_kept_and_a_share_of_the_emptiness():
+def test_all_matter_is_kept_and_a_share_of_the_emptiness(in_force):
     field, rays = Gaussian(density=8.0), RaySampler([BOX]).draw(2000, seeded())
-    whole = query_teacher(field, *rays, 0.05, seeded(3), everything).points
     kept = query_teacher(field, *rays, 0.05, seeded(3)).points
+    in_force(EVERYTHING)
+    whole = query_teacher(field, *rays, 0.05, seeded(3)).points
     matter = [(points.sigma * 0.05 > TeacherConfig.occupied_depth).sum() for points in (whole, kept)]
     assert matter[0] == matter[1] > 1000
     assert abs((len(kept) - matter[1]) / (len(whole) - matter[0]) - TeacherConfig.empty_share) < 0.02
 
 
-def test_transmittance_of_points_is_the_rays():
+def test_transmittance_of_points_is_the_rays(in_force):
     """In a medium of σ = 4, behind a length x of it, exp(-4 x) to within the step."""
+    in_force(EVERYTHING)
     rays_o, rays_d = np.array([[-3.0, 0, 0]] * 200), np.array([[1.0, 0, 0]] * 200)
-    points = query_teacher(Slab(density=4.0), rays_o, rays_d, 0.02, seeded(), everything).points
+    points = query_teacher(Slab(density=4.0), rays_o, rays_d, 0.02, seeded()).points
     deep = (points.where[:, 0] + 0.3).clamp(0, 0.7)
     wanted = torch.exp(-4 * deep)
     assert ((points.transmittance / wanted).log().abs() < 4 * 0.021).all()

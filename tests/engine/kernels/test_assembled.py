@@ -21,7 +21,7 @@ from fusedrf_cli.engine.encodings import (
 )
 from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
-from fusedrf_cli.engine.kernels import instances, light, loops, primitives, specialise
+from fusedrf_cli.engine.kernels import instances, learning, light, loops, primitives, specialise
 from fusedrf_cli.engine.kernels.assembled import OPTIONAL, READS, TEMPLATES, assemble
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
@@ -202,7 +202,7 @@ def test_no_two_parts_of_a_namespace_define_one_name(field, space):
     own = {name for name in {*device_module, *field.device_module.sizes(field)} if not name.startswith("__")}
     hooks = {template.__name__ for template in TEMPLATES} | set(OPTIONAL)
     settings = {"LEARN_FROM", "SHADING_COST"}
-    for module in (loops, space, primitives, instances, light):
+    for module in (loops, learning, space, primitives, instances, light):
         allowed = {loops: hooks | settings, space: settings}.get(module, set())
         others = {
             name for name in own & set(vars(module)) if device_module.get(name) is not vars(module)[name]

@@ -22,7 +22,8 @@ def test_cache_is_the_users_and_named_for_what_is_inlined(tmp_path, monkeypatch)
     assert folder.is_dir() and folder.is_relative_to(tmp_path / "fusedrf")
     read, engine = Path.read_bytes, Path(kernels.__file__).parent.parent
     changed = [
-        *("kernels/primitives.py", "kernels/loops.py", "kernels/prefetch.py", "spaces/bounded.py"),
+        *("kernels/primitives.py", "kernels/loops.py", "kernels/learning.py", "kernels/prefetch.py"),
+        *("spaces/bounded.py", "kernels/bundles.py", "kernels/lens.py"),
         *("encodings/line.py", "decoders/sh_basis.py", "encodings/plane_line.py", "encodings/bricks.py"),
     ]
     folders = {folder}

@@ -9,7 +9,7 @@ import pytest
 
 from fusedrf_cli.engine.decoders import density_sum, sh, sh_basis
 from fusedrf_cli.engine.encodings import bricks, line, plane_line
-from fusedrf_cli.engine.kernels import instances, light, loops, primitives, specialise
+from fusedrf_cli.engine.kernels import instances, learning, light, loops, primitives, specialise
 from fusedrf_cli.engine.kernels.assembled import assemble
 from fusedrf_cli.engine.spaces import SPACES, bounded
 from tests.engine.kinds.cases import KINDS
@@ -167,7 +167,7 @@ HOOKS = {
 def test_no_name_means_two_things_in_a_namespace(name, space):
     """It is flat, and the later name wins: a template's constant would be a kind's offset in scratch."""
     field = KINDS[name]()
-    ours = [vars(module) for module in (primitives, loops, instances, light, space)]
+    ours = [vars(module) for module in (primitives, loops, learning, instances, light, space)]
     theirs = vars(field.device_module)
     meanings: dict[str, object] = {}
     for names in (*ours, theirs, field.device_module.sizes(field)):

@@ -15,7 +15,7 @@ from fusedrf_cli.bridge.scene import stored
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.encodings import plane_line
-from fusedrf_cli.engine.encodings.hash_runs import EMPTY_FROM, STEPS, HashGrid, hashed_row
+from fusedrf_cli.engine.encodings.hash_runs import EMPTY_FROM, HashGrid, hashed_row
 from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.kinds import field_cutting, registry
 from fusedrf_cli.engine.kinds.builder import StorageSetting
@@ -101,7 +101,7 @@ def test_pictures_sample_it_by_its_spacing_where_that_is_finer_than_texels():
     smaller = fine.resampled(fine.aabb, (9, 9, 9)).with_occupancy(fine.occupancy)
     stored = VMField.from_state(*fine.state())
     for field in (fine, smaller, stored, fine.resampled(fine.aabb, (9, 9, 9))):
-        assert sampling_step(field) == pytest.approx(STEPS * 0.01)
+        assert sampling_step(field) == pytest.approx(2 * 0.01)
 
 
 def test_what_is_left_without_it_answers_as_planes_and_lines_do():

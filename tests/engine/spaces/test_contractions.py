@@ -20,7 +20,8 @@ from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.differentiable import query
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid
 from fusedrf_cli.engine.kernels import specialise
-from fusedrf_cli.engine.kernels.instances import FARTHEST, Instances
+from fusedrf_cli.engine.kernels.instances import Instances
+from fusedrf_cli.engine.kernels.primitives import FARTHEST
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
 from fusedrf_cli.engine.spaces import (
@@ -353,9 +354,9 @@ class Interpreted:
         self.names["item"] = self.names[item]
         self.names["each"](field, grid, asked, count, per_task, 1, out)
 
-    def sweep(self, item, field, grid, batch, count, most, grads, loss):
+    def sweep(self, item, field, grid, batch, count, most, out):
         self.names["item"] = self.names[item]
-        self.names["sweep"](field, grid, batch, count, most, grads, loss)
+        self.names["sweep"](field, grid, batch, count, most, *out)
 
 
 def hashed_in(space, dtype=torch.float64, share: float = 0.6) -> HashGrid:

@@ -13,7 +13,7 @@ from fusedrf_cli.engine.distillation.camera_visibility import shown_cells
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.differentiable import query
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid
-from fusedrf_cli.engine.kernels.loops import DEPTH_TOLERANCE
+from fusedrf_cli.engine.kernels.learning import DEPTH_TOLERANCE
 from fusedrf_cli.engine.kernels.specialise import specialised
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.builder import StorageSetting

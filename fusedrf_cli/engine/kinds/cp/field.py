@@ -7,8 +7,6 @@ from fusedrf_cli.engine.decoders import density_sum, sh_basis
 from fusedrf_cli.engine.encodings import line
 from fusedrf_cli.engine.fields.assembled import AssembledField, RankedShape, Slot
 
-BASIS_RATE = 0.05  # TensoRF: 1e-3 for the colour basis where lines learn at 2e-2
-
 
 @dataclass(frozen=True)
 class CPShape(RankedShape):
@@ -32,5 +30,6 @@ class CPField(AssembledField):
             "density": Slot(line, {"rank": shape.density_rank}, "density_"),
             "colour": Slot(line, {"rank": shape.colour_rank}, "colour_"),
             "sigma": Slot(density_sum),
-            "rgb": Slot(sh_basis, basis, "colour_", rate=BASIS_RATE),
+            # TensoRF: 1e-3 for the colour basis where lines learn at 2e-2
+            "rgb": Slot(sh_basis, basis, "colour_", rate=0.05),
         }

@@ -29,16 +29,7 @@ class BrickLimits:
 
 
 MAX_LEVEL = 7
-LONGEST = (1 << 20) // (SIDE << MAX_LEVEL)  # top cells along an axis: places in units fit in 21 bits
-
 EMPTY, BRICK, SPLIT = 0, 1, 2
-MORTON_SPREAD = (  # shifts and masks that put two zeros behind each of 21 bits
-    (32, 0x1F00000000FFFF),
-    (16, 0x1F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
 
 
 @dataclass(frozen=True)
@@ -201,13 +192,12 @@ class BrickTree:
         return offset, depth, table
 
     def voxels_at(
-        self, halves: np.ndarray, n: int, active: np.ndarray, finest: int | None = None
+        self, halves: np.ndarray, n: int, active: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(brick, or -1; voxel in it, counted along its n a side; whether that is active) at points (M, 3)
-        int64 given in odd halves of a unit, which is a voxel of level `finest`; None: of this tree's own
-        depth."""
+        int64 given in odd halves of a unit, which is a finest voxel."""
         offset, depth, table = self.tables
-        span = 2 * SIDE << (self.depth if finest is None else finest)
+        span = 2 * SIDE << self.depth
         cell = halves // span
         inside = ((cell >= 0) & (cell < np.asarray(self.counts))).all(1)
         cell = np.where(inside[:, None], cell, 0)
@@ -263,9 +253,10 @@ def sides(top) -> np.ndarray:
 def check_counts(counts) -> None:
     """Raise ValueError where there are more top cells than a tree may have."""
     limits = current(BrickLimits)
-    if max(counts) > LONGEST or np.prod(np.asarray(counts, np.float64)) > limits.top_cells:
+    longest = (1 << 20) // (SIDE << MAX_LEVEL)  # so that positions in units fit in 21 bits
+    if max(counts) > longest or np.prod(np.asarray(counts, np.float64)) > limits.top_cells:
         raise ValueError(
-            f"counts should be at most {LONGEST} top cells each and {limits.top_cells} in all, found "
+            f"counts should be at most {longest} top cells each and {limits.top_cells} in all, found "
             f"{list(counts)}"
         )
 
@@ -288,10 +279,17 @@ def key_positions(keys: np.ndarray) -> np.ndarray:
 
 def morton(positions: np.ndarray) -> np.ndarray:
     """(M,) uint64: the bits of three whole numbers (M, 3) from 0 to 2^21 - 1, interleaved, x the highest."""
+    spread = (  # shifts and masks that put two zeros behind each of 21 bits
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    )
     codes = np.zeros(len(positions), np.uint64)
     for axis in range(3):
         bits = positions[:, axis].astype(np.uint64)
-        for shift, mask in MORTON_SPREAD:
+        for shift, mask in spread:
             bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
         codes |= bits << np.uint64(2 - axis)
     return codes

@@ -59,9 +59,6 @@ class BricksConfig:
     """Along the longest axis, at most, unless there are more top cells."""
 
 
-MAX_TERMS = 64.0  # of a logit, each a coefficient times at most 3
-
-
 @dataclass(frozen=True)
 class SparseShape(HarmonicShape):
     """What a vertex holds."""
@@ -361,7 +358,8 @@ class SparseField(Assembled):
             if stored is None or stored.shape != expected:
                 have = "nothing" if stored is None else list(stored.shape)
                 raise ValueError(f"array '{name}' should have shape {list(expected)}, found {have}")
-            if not float(np.abs(stored).max(initial=0)) * max(field.scale, MAX_TERMS) <= MAX_ANSWER:
+            # a logit has at most 64 terms, each a coefficient times at most 3
+            if not float(np.abs(stored).max(initial=0)) * max(field.scale, 64.0) <= MAX_ANSWER:
                 raise ValueError(f"array '{name}' holds numbers whose answers would be beyond {MAX_ANSWER:g}")
             order, runs = lattice.stored_order if in_runs else (slice(lattice.free), None)
             if in_runs and not np.array_equal(arrays.get(runs_of(name)), runs):

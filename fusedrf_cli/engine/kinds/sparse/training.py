@@ -12,8 +12,6 @@ from fusedrf_cli.engine.kernels.reference import OCTANTS
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree
 from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice
 
-INSIDE = 1e-6  # of a voxel: so far from its corners it is asked whether it lies in an occupied cell
-
 
 def whole_lattice(box: np.ndarray, resolution: tuple[int, int, int]) -> VertexLattice:
     """The vertices of a box (6,) in whole bricks of one level, at least as many per axis as asked."""
@@ -31,7 +29,8 @@ def occupied_voxels(
     None where there is none."""
     low, high = lattice.positions[lattice.corners[:, 0]], lattice.positions[lattice.corners[:, 7]]
     reached = contains((low + high) / 2)
-    for octant in INSIDE + (1 - 2 * INSIDE) * OCTANTS:
+    inset = 1e-6  # of a voxel, so that no corner is a neighbour's
+    for octant in inset + (1 - 2 * inset) * OCTANTS:
         reached |= contains(low + (high - low) * octant)
     return of_voxels(lattice, reached)
 

@@ -19,8 +19,6 @@ from fusedrf_cli.engine.kinds.sparse.field import SparseField
 from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice, corner_offsets
 from fusedrf_cli.engine.settings import current
 
-CORRECTIONS = 3
-
 
 def fill(field: SparseField, teacher: RadianceField, sigma: np.ndarray, facing: np.ndarray) -> None:
     """Give the vertices the numbers that show what the teacher does, whose σ there is known (V,), and the
@@ -62,7 +60,7 @@ def coarser(
     values = values.astype(np.float32)
     share = (1 / np.maximum(total, 1e-12))[:, None].astype(np.float32)
     blended = share * (weighted @ values)
-    for _ in range(CORRECTIONS):
+    for _ in range(3):  # corrections
         blended += share * (weighted @ (values - matrix @ blended))
     return blended, total
 

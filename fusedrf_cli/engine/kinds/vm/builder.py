@@ -35,8 +35,6 @@ from fusedrf_cli.engine.kinds.vm.trimming import (
 )
 from fusedrf_cli.engine.settings import current
 
-MAX_DEGREE = 3
-
 
 @dataclass(frozen=True)
 class VMBuilderConfig:
@@ -53,7 +51,7 @@ class VMBuilderConfig:
 def shape_within(storage: StorageSetting) -> VMShape:
     """The most components and bands that a way lets a field have."""
     ranks = storage.ranks or (MAX_RANK, MAX_RANK)
-    return VMShape(*ranks, MAX_DEGREE if storage.sh_degree is None else storage.sh_degree)
+    return VMShape(*ranks, 3 if storage.sh_degree is None else storage.sh_degree)
 
 
 class VMKind(BoxKind):

@@ -15,7 +15,7 @@ import torch
 from fusedrf_cli.engine.composition.affine import WHITE
 from fusedrf_cli.engine.decoders import density_sum, sh_basis
 from fusedrf_cli.engine.encodings import plane_line, plane_line_hash
-from fusedrf_cli.engine.encodings.hash_runs import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, ROW, HashGrid
+from fusedrf_cli.engine.encodings.hash_runs import ROW, HashGrid
 from fusedrf_cli.engine.fields.assembled import AssembledField, RankedShape, Slot
 from fusedrf_cli.engine.fields.base import FieldMemory
 from fusedrf_cli.engine.fields.box import LINE, ParameterBlock, checked_box, whole_numbers
@@ -45,7 +45,6 @@ class VMConfig:
     """Of a field that is read: of a hash grid a file may hold few rows."""
 
 
-TENSOR = "tensor_0."  # in front of the names that its arrays have in files
 DETAIL = "density_detail"  # the rows of the hash grid
 
 
@@ -112,7 +111,7 @@ class VMField(AssembledField):
     @classmethod
     def stored_name(cls, name: str) -> str:
         """See BoxField."""
-        return TENSOR + ("detail" if name == DETAIL else name)
+        return "tensor_0." + ("detail" if name == DETAIL else name)
 
     def numbers(self) -> dict[str, np.ndarray]:
         """The arrays of numbers that files have, by name; of a hash grid that few cells can ask the rows
@@ -217,15 +216,18 @@ def hashed_of(stored: dict, box: np.ndarray) -> HashGrid:
     """A hash grid as metadata tell it, of a field over a box (6,). Raises ValueError naming what does not
     fit."""
     spacings, rows = stored["spacings"], stored["rows"]
-    if type(rows) is not int or not 0 < rows <= MAX_ROWS or not 1 <= len(spacings) <= MAX_LEVELS:
+    max_levels, max_rows = 8, 1 << 24
+    # along an axis: past it, float32 would not tell where between two a point is
+    max_vertex = 1 << 20
+    if type(rows) is not int or not 0 < rows <= max_rows or not 1 <= len(spacings) <= max_levels:
         raise ValueError(
-            f"a hash grid has 1 to {MAX_LEVELS} levels of at most {MAX_ROWS} rows, found {len(spacings)} of "
+            f"a hash grid has 1 to {max_levels} levels of at most {max_rows} rows, found {len(spacings)} of "
             f"{rows}"
         )
     hashed = HashGrid(tuple(float(h) for h in spacings), rows)
-    if not np.abs(box).max() <= MAX_VERTEX * min(hashed.spacings):
+    if not np.abs(box).max() <= max_vertex * min(hashed.spacings):
         raise ValueError(
-            f"the vertices of a hash grid should be numbered up to {MAX_VERTEX}, but its box reaches to "
+            f"the vertices of a hash grid should be numbered up to {max_vertex}, but its box reaches to "
             f"{np.abs(box).max():g} and its 'spacings' are {list(hashed.spacings)}"
         )
     return hashed

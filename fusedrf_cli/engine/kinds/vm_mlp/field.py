@@ -17,7 +17,6 @@ from fusedrf_cli.engine.kinds.vm.field import VMConfig, VMField, box_metadata
 from fusedrf_cli.engine.settings import current
 
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
-WIDTH = 64
 MAX_WIDTH = 256  # of a stored field
 
 
@@ -26,7 +25,7 @@ class VMMLPShape(RankedShape):
     """Ranks; the degree stands for the number of features."""
 
     sh_degree: int = FEATURE_DEGREE
-    width: int = WIDTH
+    width: int = 64
     """Outputs of the network's hidden layers."""
     hashed = None
 
