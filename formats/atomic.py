@@ -92,6 +92,8 @@ def check_writable(path: Path | str, overwrite: bool, *, folders: bool = False) 
 
     Raises OutputExists or ResourceError.
     """
+    if not str(path):
+        raise ResourceError("the path of the output is empty; name a file")
     target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
         raise ResourceError(f"{path}: its folder {target.parent} does not exist; create it first")

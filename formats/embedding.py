@@ -51,7 +51,7 @@ class Embedding:
             return replace(node, field=self.member(self.bundle(path), node.field))
         if node.source is None:
             return node
-        target = resolve_source(path, node.source, self.allow_outside)
+        target = resolve_source(path, node.source, self.allow_outside, node.name)
         inner = self.bundle(target).scene
         child_nodes = tuple(
             self.node(child, target, f"{node.name}/", inner.composition) for child in inner.nodes

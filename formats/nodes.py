@@ -150,8 +150,10 @@ def make_node(
 
 
 def check_name(name: str) -> None:
-    if not isinstance(name, str) or not 0 < len(name.encode(errors="replace")) <= MAX_NAME_BYTES:
-        raise BadName(f"node name {str(name)[:40]!r} is empty or longer than {MAX_NAME_BYTES} bytes")
+    if not isinstance(name, str) or not name:
+        raise BadName(f"node name {name!r} is no name; give one of at least one character")
+    if (size := len(name.encode(errors="replace"))) > MAX_NAME_BYTES:
+        raise BadName(f"node name '{name[:40]}…' has {size:,} bytes; give one of at most {MAX_NAME_BYTES}")
     if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") or c in BIDIRECTIONAL for c in name):
         raise BadName(f"node name {name!r} holds control characters; use printable ones")
 
@@ -186,8 +188,11 @@ def _placement_matrix(placement: dict, name: str) -> np.ndarray:
     norm = math.hypot(*turn)
     if abs(norm - 1) > QUATERNION_SLACK:
         raise BadSchema(f"node {name!r}: rotation has length {norm:.6g}, expected a unit quaternion xyzw")
+    scale = _numbers(placement.get("scale", [1, 1, 1]), (3,), name, "scale")
+    if 0 in scale:
+        raise SingularTransform(f"node {name!r}: scale {scale.tolist()} is not three numbers, none of them 0")
     matrix = np.eye(4)
-    matrix[:3, :3] = matrices(turn / norm) * _numbers(placement.get("scale", [1, 1, 1]), (3,), name, "scale")
+    matrix[:3, :3] = matrices(turn / norm) * scale
     matrix[:3, 3] = _numbers(placement.get("translation", [0, 0, 0]), (3,), name, "translation")
     return matrix
 

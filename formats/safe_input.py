@@ -37,6 +37,8 @@ def open_input(path: Path | str) -> BinaryIO:
 
 
 def _unopened(path: Path | str, error: Exception) -> Exception:
+    if not str(path):
+        return MissingFile("the path is empty; give that of a file")
     if isinstance(error, ValueError) or error.errno in (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG):
         return MissingFile(f"{path}: no such file; check the spelling and the folder it is relative to")
     if error.errno in (errno.EISDIR, errno.ENXIO, errno.ELOOP):

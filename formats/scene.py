@@ -12,6 +12,7 @@ import unicodedata
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -219,7 +220,8 @@ def parse_scene(data: bytes, where: str) -> SceneGraph:
         history = tuple(spec.history)
         return SceneGraph(roots, spec.composition, history, spec.generator, spec.version, extras, *shown)
     except msgspec.ValidationError as error:
-        raise BadSchema(f"{where}: {error}") from error
+        word = "unknown field" in str(error) and _unknown_word(nodes)
+        raise BadSchema(f"{where}: {word or error}") from error
     except FormatError as error:
         raise error.within(where) from error
 
@@ -320,13 +322,29 @@ def _framing(content: dict) -> tuple[float, ...] | None:
 
 def _check_extent(nodes: object, where: str) -> None:
     """Count and depth on the raw JSON, before anything recurses into it."""
-    level, count, depth = nodes if isinstance(nodes, list) else [], 0, 0
-    while level:
-        count, depth = count + len(level), depth + 1
+    count = 0
+    for depth, level in enumerate(_levels(nodes), 1):
+        count += len(level)
         if count > MAX_NODES or depth > MAX_DEPTH:
             raise LimitExceeded(f"{where}: more than {MAX_NODES:,} nodes or {MAX_DEPTH} levels of children")
+
+
+def _levels(nodes: object) -> Iterator[list]:
+    """What stands where nodes should, of raw JSON: the roots, their children, and so on."""
+    level = nodes if isinstance(nodes, list) else []
+    while level:
+        yield level
         lists = [node.get("children") for node in level if isinstance(node, dict)]
         level = [child for children in lists if isinstance(children, list) for child in children]
+
+
+def _unknown_word(nodes: object) -> str:
+    """What is wrong with the first node that has a word which nodes do not have; nothing where none does."""
+    for node in chain.from_iterable(_levels(nodes)):
+        if isinstance(node, dict) and (unknown := sorted(node.keys() - set(NODE_KEYS))):
+            words = ", ".join(NODE_KEYS)
+            return f"node {node.get('name')!r} has the word {unknown[0]!r}, expected some of {words}"
+    return ""
 
 
 def _known(nodes: object) -> object:

@@ -20,25 +20,29 @@ from formats.nodes import Node
 from formats.scene import MAX_DEPTH, MAX_NODES, SceneGraph, is_scene, read_scene
 
 
-def resolve_source(scene_path: Path | str, source: str, allow_outside: bool = False) -> Path:
-    """The existing file or folder that `source`, written in `scene_path`, means.
+def resolve_source(scene_path: Path | str, source: str, allow_outside: bool = False, node: str = "") -> Path:
+    """The existing file or folder that `source`, written in `scene_path`, means; node: whose it is.
 
     Raises OutsideFolder for anything that may lead out of the scene's folder (absolute, `..`, a drive, a
     link), MissingFile where nothing is there.
     """
     folder = Path(scene_path).parent
     plain = unicodedata.normalize("NFKC", source)
+    where = f"{scene_path}: node {node!r}: source {source!r}" if node else f"{scene_path}: source {source!r}"
     if not source or not source.isprintable():
-        raise BadName(f"{scene_path}: source {source!r} is not a path; expected printable characters")
+        raise BadName(f"{where} is not a path; expected printable characters")
     parts = re.split(r"[/\\]", plain)
     drive = re.match(r"[A-Za-z][A-Za-z0-9+.\-]*:", plain)
     path = folder / source
     inside = Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
     if not allow_outside and (".." in parts or parts[0] == "" or drive or not inside):
-        what = f"{scene_path}: source {source!r} leads out of the scene's folder"
-        raise OutsideFolder(f"{what}; move the file in, or give --allow-outside")
+        raise OutsideFolder(
+            f"{where} leads out of the scene's folder; move the file in, or give --allow-outside"
+        )
     if not os.path.exists(path):
-        raise MissingFile(f"{scene_path}: source {source!r} does not exist (looked for at {path})")
+        raise MissingFile(
+            f"{where} does not exist; put it at {os.path.abspath(path)}, or name another source"
+        )
     return path
 
 
@@ -89,7 +93,7 @@ class _Expansion:
         node = replace(node, name=prefix + node.name, children=children)
         if node.source is None:
             return node
-        target, real, inner = self.find(path, node.source)
+        target, real, inner = self.find(path, node)
         if inner is None:
             return node if path.parent == self.folder else replace(node, source=self.relative(target))
         if real in trail:
@@ -98,13 +102,14 @@ class _Expansion:
         nested = self.nodes(inner.nodes, target, node.name + "/", (*trail, real), inner.composition)
         return holding(node, nested, rule, inner.composition)
 
-    def find(self, path: Path, source: str) -> tuple[Path, str, SceneGraph | None]:
-        """The source's path as written, its real path, and its scene (None if it is none), looked up once."""
-        if (path, source) not in self.found:
-            target = resolve_source(path, source, self.allow_outside)
+    def find(self, path: Path, node: Node) -> tuple[Path, str, SceneGraph | None]:
+        """The path of a node's source as written, its real path, and its scene (None if it is none), looked
+        up once."""
+        if (path, node.source) not in self.found:
+            target = resolve_source(path, node.source, self.allow_outside, node.name)
             inner = read_scene(target) if is_scene(target) else None
-            self.found[path, source] = target, os.path.realpath(target), inner
-        return self.found[path, source]
+            self.found[path, node.source] = target, os.path.realpath(target), inner
+        return self.found[path, node.source]
 
     def relative(self, target: Path) -> str:
         return Path(os.path.relpath(target, self.folder)).as_posix()

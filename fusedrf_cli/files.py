@@ -13,6 +13,7 @@ from formats.scene import (
     Node,
     SceneGraph,
     dump_scene,
+    is_scene,
     make_node,
     parse_scene,
     read_scene,
@@ -60,7 +61,7 @@ def compose(request: ComposeRequest, progress) -> dict:
 
 def _node(entry: Input, name: str, request: ComposeRequest) -> Node:
     source = _relative(entry.path, request.output)
-    resolve_source(request.output, source, request.allow_outside)
+    resolve_source(request.output, source, request.allow_outside, name)
     shown = {key: getattr(entry, key) for key in ("crop", "opacity", "tint")}
     showing = {key: value for key, value in shown.items() if value is not None}
     showing |= {"visible": False} if entry.hidden else {}
@@ -96,8 +97,26 @@ def info(request: InfoRequest, progress) -> dict:
     """What is in a bundle or a scene, without decoding arrays, or what `train` would read."""
     if request.scene == STDIO:
         scene, size = _stdin_scene()
-        return summary_of(scene, STDIO, size)
-    return overview(request.scene) or read_summary(request.scene)
+        return summary_of(scene, STDIO, size) | {"notes": _notes(scene, "standard input")}
+    summary = overview(request.scene) or read_summary(request.scene)
+    if summary["format"] == "scene":
+        summary |= {"notes": _notes(read_scene(request.scene), request.scene)}
+    return summary
+
+
+def _notes(scene: SceneGraph, path: str) -> list[str]:
+    """What of a plain scene no command would take."""
+    notes = [] if scene.leaves() else [f"{path}: the scene places nothing; give a node a 'source'"]
+    for leaf in scene.leaves():
+        try:
+            target = resolve_source(path, leaf.source, node=leaf.name)
+        except FormatError as error:
+            notes.append(str(error))
+        else:
+            if not (is_bundle(target) or is_scene(target)):
+                where = f"{path}: node {leaf.name!r}: source {leaf.source!r}"
+                notes.append(f"{where} is no bundle and no scene; train it to a .rfpack first")
+    return notes
 
 
 def history(request: HistoryRequest, progress) -> dict:
@@ -158,7 +177,7 @@ def _check(path: str, allow_outside: bool, seen: set[str]) -> None:
     scene = inline_scenes(_scene(path), path, allow_outside)
     for leaf in scene.leaves():
         if leaf.source is not None:
-            target = resolve_source(path, leaf.source, allow_outside)
+            target = resolve_source(path, leaf.source, allow_outside, leaf.name)
             if os.path.realpath(target) not in seen:
                 _check(str(target), allow_outside, seen)
 

@@ -248,6 +248,8 @@ class InputType(click.Path):
         super().__init__(allow_dash=stdin)
 
     def convert(self, value, param, ctx):
+        if not value:
+            raise MissingFile(f"{param.get_error_hint(ctx)} is an empty path; give that of a file")
         if not (value == STDIO and self.allow_dash) and not os.path.exists(value):
             raise MissingFile(f"{value}: no such file; check the spelling and the folder it is relative to")
         return value

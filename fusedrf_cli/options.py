@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import re
 import warnings
 from collections.abc import Callable, Iterator
 from typing import get_args
@@ -39,6 +40,23 @@ class RenamedOption(click.Option):
         super().add_to_parser(parser, ctx)
         for earlier, flag in self.earlier.items():
             parser._long_opt[earlier] = parser._long_opt[flag]
+
+
+class NumbersCommand(click.Command):
+    """A command of which a word that begins as a negative number does is an argument, and no option."""
+
+    def make_parser(self, ctx: click.Context):
+        parser = super().make_parser(ctx)
+        process = parser._process_opts
+
+        def process_word(word: str, state) -> None:
+            if re.match(r"-[\d.]", word):
+                state.largs.append(word)
+            else:
+                process(word, state)
+
+        parser._process_opts = process_word
+        return parser
 
 
 # --- options ------------------------------------------------------------------------------------------------
@@ -86,6 +104,13 @@ time_budget = click.option(
     type=PositiveType(),
     metavar="S",
     help="Stop learning after S seconds, all tries together.",
+)
+fused_time_budget = click.option(
+    "--time-budget",
+    type=PositiveType(),
+    metavar="S",
+    help="Stop learning after S seconds, all tries together; what comes before, such as sampling the scene "
+    "for dense and sparse, is not counted.",
 )
 max_size = click.option("--max-size", type=BytesType(), help="Largest output file, such as 25MB.")
 fused_max_size = click.option(

@@ -37,10 +37,11 @@ def lines(report: dict) -> Iterator[str]:
     yield from _lines(facts, "")
 
 
-def _lines(facts: dict, indent: str) -> Iterator[str]:
+def _lines(facts: dict, indent: str, around: str = "") -> Iterator[str]:
+    """around: the keys that the facts stand in."""
     for key, value in facts.items():
         label = f"{indent}{key.replace('_', ' ')}"
-        if value is None or value == [] or value == {}:
+        if value in (None, "", [], {}):
             continue
         if _is_table(value):
             yield f"{label}:"
@@ -50,26 +51,27 @@ def _lines(facts: dict, indent: str) -> Iterator[str]:
             yield from (f"{indent}  {sentence}" for sentence in value)
         elif isinstance(value, dict) and any(isinstance(part, dict | list) for part in value.values()):
             yield f"{label}:"
-            yield from _lines(value, indent + "  ")
+            yield from _lines(value, indent + "  ", f"{around}{key} ")
         else:
-            yield f"{label}: {_phrase(key, value)}"
+            yield f"{label}: {_phrase(around + key, value)}"
 
 
 def _phrase(key: str, value: object) -> str:
     """One value on one line, with the unit that follows from its `key`."""
     if isinstance(value, dict):
-        parts = ((name.replace("_", " "), _phrase(f"{key} {name}", part)) for name, part in value.items())
-        return ", ".join(f"{name} {phrase}" for name, phrase in parts)
+        told = ((name, part) for name, part in value.items() if part is not None)
+        return ", ".join(f"{name.replace('_', ' ')} {_phrase(f'{key} {name}', part)}" for name, part in told)
     if isinstance(value, list):
         shown = value if len(value) <= _LONGEST_LIST else value[:_LONGEST_LIST]
         rest = f" and {len(value) - len(shown)} more" if len(shown) < len(value) else ""
         return " ".join(_coordinate(part) or _phrase(key, part) for part in shown) + rest
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if key.split(" ")[0] == "bytes" or key.endswith("_bytes"):
+    if "bytes" in key.split(" ") or key.endswith("_bytes"):
         return readable_size(value)
     if isinstance(value, float):
-        unit = " s" if "seconds" in key else " dB" if "psnr" in key and not key.endswith("views") else ""
+        decibels = "psnr" in key and not key.endswith(("views", "share"))
+        unit = " s" if "seconds" in key else " dB" if decibels else ""
         return f"{value + 0.0:.4g}{unit}"  # + 0.0: no "-0"
     return str(value)
 

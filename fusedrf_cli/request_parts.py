@@ -1,7 +1,9 @@
 """What several requests share (requests.py)."""
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from msgspec import Meta
@@ -49,6 +51,8 @@ class Writing:
 
     folders: ClassVar[bool] = False
     """Whether the output may be a folder."""
+    endings: ClassVar[tuple[str, ...]] = ()
+    """Of files, where it may be a folder."""
     stdout: ClassVar[bool] = False
     """Whether an output of "-" is stdout."""
     overwrite: bool = False
@@ -68,6 +72,14 @@ class Sizing:
     ranks: tuple[Count, Count] | None = None
     """Components per mode of density and of colour at most."""
     sh_degree: ShDegree | None = None
+
+
+def ending_of(output: str) -> str:
+    """The ending of a file's name, such as .png; "" of a folder, whose name has none or ends in a slash, or
+    that is there."""
+    ending = Path(output).suffix.lower()
+    is_folder = output.endswith(("/", os.sep)) or os.path.isdir(output)
+    return ending if ending[1:2].isalpha() and not is_folder else ""
 
 
 class Node:

@@ -27,6 +27,7 @@ from fusedrf_cli.request_parts import (
     Sphere,
     Vector,
     Writing,
+    ending_of,
 )
 
 
@@ -178,6 +179,10 @@ class DeleteRequest(EditRequest, HoleRequest):
     """Whether what fills a hole finishes on pictures."""
     allow_outside: bool = False
 
+    def __post_init__(self):
+        if twice := [name for name in dict.fromkeys(self.names) if self.names.count(name) > 1]:
+            raise UsageProblem(f"{', '.join(twice)}: is to be deleted twice; give each name once")
+
 
 @dataclass(frozen=True)
 class ReplaceRequest(EditRequest):
@@ -275,6 +280,11 @@ class RenameRequest(ArrangeRequest, Node):
     new_name: str
     output: str
 
+    def __post_init__(self):
+        if self.name == self.new_name:
+            raise UsageProblem(f"'{self.name}' is its name already; give a new one")
+        super().__post_init__()
+
 
 @dataclass(frozen=True)
 class UndoRequest(Writing):
@@ -321,6 +331,7 @@ class RenderRequest(Writing, Running):
     """Pictures or a film of a scene."""
 
     folders: ClassVar[bool] = True
+    endings: ClassVar[tuple[str, ...]] = (".png", ".gif", ".mp4")
     scene: str
     output: str
     _: KW_ONLY
@@ -368,7 +379,7 @@ class RenderRequest(Writing, Running):
     def beside(self) -> dict[str, bool]:
         from formats.filenames import depth_of
 
-        single = Path(self.output).suffix.lower() == ".png"
+        single = ending_of(self.output) == ".png"
         return {str(depth_of(Path(self.output))): False} if self.depth and single else {}
 
 

@@ -19,7 +19,7 @@ from fusedrf_cli import requests
 from fusedrf_cli.engine.settings import using
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.progress import NullProgress
-from fusedrf_cli.request_parts import STDIO
+from fusedrf_cli.request_parts import STDIO, ending_of
 from fusedrf_cli.requests import EditRequest, Writing
 
 __all__ = [
@@ -93,6 +93,9 @@ def locked_outputs(request: Writing, progress: NullProgress) -> Iterator[None]:
     outputs = {request.output: request.folders} | others
     if len({os.path.realpath(path) for path in outputs}) <= len(others):
         raise UsageProblem(f"{request.output}: two outputs go there; give them different names")
+    for path, folder in outputs.items():
+        if folder:
+            _check_ending(path, request.endings if path == request.output else ())
     edited = getattr(request, "fused", None)
     in_place = edited is not None and os.path.realpath(edited) == os.path.realpath(request.output)
     check_all = functools.partial(_check_all, check_writable, outputs, request.overwrite)
@@ -107,6 +110,16 @@ def locked_outputs(request: Writing, progress: NullProgress) -> Iterator[None]:
 
             check_history_folder(edited, request.output)
         yield
+
+
+def _check_ending(path: str, endings: Sequence[str]) -> None:
+    """UsageProblem where a name is that of a file of a kind that is not written."""
+    ending = ending_of(path)
+    if ending and ending not in endings:
+        files = f"give a name that ends in {', '.join(endings)}, or" if endings else "give"
+        raise UsageProblem(
+            f"{path}: no {ending} is written; {files} a folder, whose name has no ending, or ends in a slash"
+        )
 
 
 def _check_all(check: Callable, outputs: dict[str, bool], overwrite: bool) -> None:

@@ -33,6 +33,7 @@ from fusedrf_cli.engine.kinds.builder import (
 )
 from fusedrf_cli.engine.kinds.instances import distinct_fields
 from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.rendering.volume import render_rays
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.requests import FuseRequest
 
@@ -45,6 +46,8 @@ class BuildingConfig:
     """That a student is judged by where what is learnt does not say so."""
     rate_in_place: float = 0.02
     """Of a student that begins as a place and has only to learn what stands in it: 3 dB."""
+    glance: int = 8192
+    """Rays by which what a source may lose is compared."""
     worth_saving: float = 10.0
     """Seconds of learning, from which on a student is saved before it is measured."""
     tries: int = 6
@@ -92,6 +95,13 @@ class BestTrial:
     did: DistillReport | None = None
     start: str | None = None
     """What it started from."""
+    own_storage: StorageSetting | None = None
+    """With the precision of each of its fields; None: as it was asked for."""
+
+    @property
+    def storage(self) -> StorageSetting:
+        """How it is stored."""
+        return self.own_storage or self.trial.storage
 
 
 def same_texels(field: StoredField, other: StoredField) -> bool:
@@ -136,6 +146,9 @@ class Maker:
         self.lessons: dict[tuple[int, int], FinetuneRays] = {}
         self.saved: Saved | None = None
         """What an interrupted run left, until it is taken up."""
+        self.glances: dict[int, FinetuneRays] = {}
+        if not builder.learnt:
+            builder.judged_by(self.error_of)
 
     def measured(self, field: Result, storage: StorageSetting) -> float:
         """PSNR (dB) of what is fused as it will be read back."""
@@ -145,11 +158,13 @@ class Maker:
         """What is fused as its bundle will be drawn: with numbers as they are stored, but for fields that
         keep the bytes of their sources."""
         kept = self.background and self.background.placed.field
+        fields = distinct_fields(field) if isinstance(field, ComposedField) else [field]
+        precisions = {id(one): storage.precision_of(i) for i, one in enumerate(fields)}
 
         def back(one: StoredField) -> StoredField:
             if id(one) in self.sources:
                 return one
-            precision = self.background.precision if one is kept else storage.precision
+            precision = self.background.precision if one is kept else precisions[id(one)]
             return stored(one, precision).to(self.device)
 
         changed = with_fields(field, back)
@@ -166,7 +181,7 @@ class Maker:
     def evaluate(self, best: BestTrial) -> dict:
         """What the report says of the views of a try as it will be read back: how many there are, the PSNR of
         what the scene covers of them, and the object that is shown worst in a view of its own."""
-        evaluation = self.evaluator.evaluate(self.read_back(best.field, best.trial.storage))
+        evaluation = self.evaluator.evaluate(self.read_back(best.field, best.storage))
         report = {
             "views": len(self.evaluation_views),
             "covered": evaluation.covered,
@@ -200,27 +215,31 @@ class Maker:
         if candidate is None:
             return None
         field, size, did = self.on_device(candidate.field, self.device), candidate.bytes, None
-        before = psnr = self.measured(self.whole(field), storage)
+        own = candidate.storage or storage
+        before = psnr = self.measured(self.whole(field), own)
         if finished and not candidate.exact and self.request.finetune and not self.budget.over:
-            learnt, did = self.finished(field)
+            learnt, did = self.finished(field, candidate.settled)
             learnt_psnr, learnt_size = (
-                self.measured(self.whole(learnt), storage),
-                builder.bytes_of(learnt, storage),
+                self.measured(self.whole(learnt), own),
+                builder.bytes_of(learnt, own),
             )
             if learnt_psnr > before and learnt_size <= limit:
                 field, psnr, size = learnt, learnt_psnr, learnt_size
         trial = Trial(storage, limit, size, psnr, before, candidate.whole, candidate.exact)
         if finished or candidate.exact:
             start = self.background and self.background.start
-            self.offer(BestTrial(trial, self.on_device(self.whole(field), "cpu"), did, start))
+            self.offer(BestTrial(trial, self.on_device(self.whole(field), "cpu"), did, start, own))
         return trial
 
-    def finished(self, field: Result) -> tuple[Result, DistillReport | None]:
-        """What was made after it learnt from rays of the scene; what is given stays as it is."""
+    def finished(
+        self, field: Result, settled: frozenset[int] = frozenset()
+    ) -> tuple[Result, DistillReport | None]:
+        """What was made after it learnt from rays of the scene; what is given stays as it is. settled: see
+        `Candidate`."""
         seconds = self.budget.part(self.tries_to_come())
         self.finished_tries += 1
         if isinstance(field, ComposedField):
-            return self.finetuned(field, seconds), None
+            return self.finetuned(field, seconds, settled), None
         learnt = field.with_params(field.params.clone())
         distil_config = self.builder.distil_config_for(field.params.numel(), seconds)
         settings = replace(distil_config, seed=self.request.seed)
@@ -279,10 +298,13 @@ class Maker:
             return max(2, config.tries - self.finished_tries)  # how many a search takes is not known
         return max(1, (search.finalists if self.builder.compares else 1) - self.finished_tries)
 
-    def finetuned(self, scene: ComposedField, seconds: float | None) -> ComposedField:
-        """A scene of smaller fields, each of which learnt from rays of its own source."""
+    def finetuned(
+        self, scene: ComposedField, seconds: float | None, settled: frozenset[int]
+    ) -> ComposedField:
+        """A scene of smaller fields, each of which learnt from rays of its own source, but for those that
+        have nothing to learn."""
         pairs = zip(distinct_fields(self.scene.composed), distinct_fields(scene), strict=True)
-        changed = [(source, one) for source, one in pairs if one is not source]
+        changed = [(source, one) for source, one in pairs if one is not source and id(one) not in settled]
         learnt = {}
         for source, one in changed:
             rays = self.rays_of(source, len(changed))
@@ -294,14 +316,29 @@ class Maker:
     def rays_of(self, source: StoredField, count: int) -> FinetuneRays:
         """What there is to learn from of a source, one of so many; drawn once."""
         if (id(source), count) not in self.lessons:
-            leaf = next(p for p in self.scene.composed.leaves() if p.field is source)
-            alone = ComposedField([Placed(leaf.name, source, np.eye(4))], origin=np.zeros(3))
-            views = [view.seen_from(leaf.object_to_world) for view in self.scene.views if leaf.unbounded]
-            rays = FinetuneRays(
-                opened(source), RaySampler.of(alone, views), self.request.seed, share=1 / count
-            )
+            sampler = self.sampler_of(source)
+            rays = FinetuneRays(opened(source), sampler, self.request.seed, share=1 / count)
             self.lessons[id(source), count] = rays
         return self.lessons[id(source), count]
+
+    def sampler_of(self, source: StoredField) -> RaySampler:
+        """Of rays around a source alone, in its own frame."""
+        leaf = next(p for p in self.scene.composed.leaves() if p.field is source)
+        alone = ComposedField([Placed(leaf.name, source, np.eye(4))], origin=np.zeros(3))
+        views = [view.seen_from(leaf.object_to_world) for view in self.scene.views if leaf.unbounded]
+        return RaySampler.of(alone, views)
+
+    def error_of(self, source: StoredField, made: StoredField, precision: str | None) -> float:
+        """See `DirectBuilder.judged_by`; over white."""
+        if id(source) not in self.glances:
+            rays = current(BuildingConfig).glance
+            glance = FinetuneRays(opened(source), self.sampler_of(source), self.request.seed, rays)
+            self.glances[id(source)] = glance
+        glance = self.glances[id(source)]
+        back = (made if precision is None else stored(made, precision)).to(self.device)
+        shown = render_rays(back, glance.rays_o, glance.rays_d)[:, :4]
+        over_white = (shown - glance.shown) @ np.eye(4, 3) - (shown - glance.shown)[:, 3:]
+        return float(np.square(over_white).mean())
 
     # -- students that learn from nothing --------------------------------------------------------------------
 

@@ -89,7 +89,7 @@ class FusedBundle:
 
     def of_learnt(self, writer: BundleWriter, made: BestTrial, background: Background | None) -> SceneGraph:
         """The graph of what was learnt, and of a background that stays."""
-        precision = made.trial.storage.precision
+        precision = made.storage.precision
         if background is None:
             return SceneGraph((self.learnt_node(add(writer, made.field, precision)),))
         source = self.background_source
@@ -111,6 +111,7 @@ class FusedBundle:
         result = made.field
         fields = distinct_fields(result) if isinstance(result, ComposedField) else [result]
         of_source = dict(zip(map(id, distinct_fields(self.composed)), fields, strict=True))
+        precisions = {id(one): made.storage.precision_of(i) for i, one in enumerate(fields)}
         # what crops leave of a field is a field of its own where numbers are stored anew
         cuts = [leaf.crops and of_source[id(f.placed.field)] is not f.placed.field for leaf, f in self.leaves]
         cut, members = any(cuts), {}
@@ -122,7 +123,7 @@ class FusedBundle:
             if id(field) not in members:
                 unchanged = field is source.placed.field
                 precision = source.bundle.headers[source.member].precision if unchanged else None
-                members[id(field)] = add(writer, opened(field), precision or made.trial.storage.precision)
+                members[id(field)] = add(writer, opened(field), precision or precisions[id(field)])
             return members[id(field)]
 
         named = iter([member(leaf, source) for leaf, source in self.leaves])

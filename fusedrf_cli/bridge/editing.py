@@ -105,7 +105,9 @@ class Draft:
     def check_free(self, name: str) -> None:
         """InvalidInput where an object has a name already."""
         if name in self.names:
-            raise InvalidInput(f"{self.path}: there is a '{name}' already; choose another name")
+            raise InvalidInput(
+                f"{self.path}: there is a '{name}' already; choose another name, or rename or delete that one"
+            )
 
     def box(self, names: Iterable[str]) -> np.ndarray | None:
         """(6,) in the world around objects as they were; None where none of them is visible."""

@@ -61,7 +61,7 @@ def chosen_of(
         "fields": fields,
         "chosen": {
             **builder.kind.describe(own),
-            "precision": trial.storage.precision,
+            **precisions(best),
             "flags": flags(builder.kind.name, trial.storage, trial.limit),
             "why": why(best, own, builder, count, background),
             **({"start": best.start} if best.start else {}),
@@ -70,6 +70,14 @@ def chosen_of(
             **neighbours,
         },
     }
+
+
+def precisions(best: BestTrial) -> dict:
+    """How the numbers of what was chosen are stored: of all, or of every field."""
+    each = [precision or "as it is" for precision in best.storage.each]
+    if not each:
+        return {"precision": best.storage.precision}
+    return {"precision": each[0]} if len(set(each)) == 1 else {"precisions": each}
 
 
 def why(

@@ -1,5 +1,6 @@
 """`fuse`: a scene to a bundle, of any kinds, by one search over the ways and sizes it can be made in."""
 
+import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
@@ -59,6 +60,7 @@ def fuse(
 ) -> dict:
     """Turn a composed scene into a bundle of it, of one field or of a field for each source, with the scene's
     history; `somewhere` writes, as `written_somewhere` does."""
+    started = time.monotonic()
     with engine(request.device, request.threads, progress) as device:
         progress.phase("reading", None)
         check_checkpoint(request.output, request.resume, request.overwrite)
@@ -71,7 +73,6 @@ def fuse(
         refuse_options(kind, request)
         if kind.field is None:
             note_options(request, loaded, progress)
-        started = time.monotonic()
         bundle = FusedBundle(request, everything, scene, kind.field is not None)
         warn_of_hidden(bundle.hidden, progress)
         cameras = result_cameras(loaded, progress)
@@ -98,6 +99,8 @@ def fuse(
             checkpoint_path(request.output).unlink(missing_ok=True)
         reports = made.resolution_reports()
         warn_of_resolution(reports, remedy(kind, scene.composed), progress)
+        if kind.field is None and request.max_size is None:
+            warn_of_default_size(made.builder.request, progress)
         figures = made.figures()
     report = {
         "output": request.output,
@@ -352,6 +355,17 @@ def make_room(memory: Memory, builder: DistilledBuilder, scene: FuseScene, reque
         advice="give a smaller --max-size",
     )
     return together
+
+
+def warn_of_default_size(request: BuildRequest, progress) -> None:
+    """Say which size would have kept the sources as they are, where only the default one was in the way."""
+    size = request.unchanged_bytes and request.overhead + request.unchanged_bytes
+    changes = request.precision or request.ranks or request.sh_degree is not None or request.target
+    if size and size > request.limit and not changes:
+        progress.warn(
+            f"fields were made smaller to fit into {readable_size(request.limit)}, the limit where none is "
+            f"given; --max-size {math.ceil(size / 1e6)}MB would keep the sources as they are"
+        )
 
 
 def warn_of_resolution(reports: list[ResolutionReport], remedy: str, progress) -> None:

@@ -100,9 +100,10 @@ class Memory:
         """What the limit leaves beside parts."""
         return self.limit - self.base - current(MemoryConfig).compiled - sum(parts.values())
 
-    def report(self) -> dict[str, int]:
-        """For a command's report: what was expected, and the most that this process ever held."""
-        return {"predicted_bytes": self.predicted, "peak_bytes": peak()}
+    def report(self) -> dict[str, int | None]:
+        """For a command's report: what was expected, None where nothing was, and the most that this process
+        ever held."""
+        return {"predicted_bytes": self.predicted or None, "peak_bytes": peak()}
 
 
 def resident() -> int:

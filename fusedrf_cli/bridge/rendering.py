@@ -23,6 +23,7 @@ from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, render_image
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import UsageProblem
+from fusedrf_cli.request_parts import ending_of
 from fusedrf_cli.requests import RenderRequest
 
 
@@ -44,7 +45,7 @@ def render(request: RenderRequest, progress) -> dict:
     name.
     """
     output = request.output
-    suffix = Path(output).suffix.lower()
+    suffix = ending_of(output)
     if suffix in FILMS:
         check_film(output)
         if request.depth or request.background is None:

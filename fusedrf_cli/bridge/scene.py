@@ -13,6 +13,7 @@ from formats.bundle import BundleWriter, FieldSet, OpenBundle, is_bundle, shared
 from formats.errors import FormatError
 from formats.graph import placement_of
 from formats.nodes import Leaf, check_affine
+from formats.object_summary import world_aabb
 from formats.records import FieldRecord, as_stored, reading_size
 from formats.scene import MAX_SCENE_BYTES, SceneGraph, dump_scene, make_node, parse_scene
 from formats.sources import expand_scene, inline_scenes, resolve_source
@@ -281,7 +282,8 @@ class _Loader:
             if leaf.field is not None:
                 fields.append((leaf, bundle, leaf.field))
             elif leaf.source is not None:
-                fields += self.sources(leaf, resolve_source(self.path, leaf.source, allow_outside))
+                target = resolve_source(self.path, leaf.source, allow_outside, leaf.name)
+                fields += self.sources(leaf, target)
         if not fields and leaves:
             raise InvalidInput(f'{self.path}: nothing of the scene is visible; remove a "visible": false')
         if not fields:
@@ -400,7 +402,12 @@ def cropped(field: StoredField, leaf: Leaf, where: str) -> StoredField:
     """As `part_shown`. InvalidInput where that is nothing."""
     shown = part_shown(field, leaf, where)
     if shown is None:
-        raise InvalidInput(f"{where}: its crop holds nothing of it; crops are in the frame of the node")
+        box = world_aabb(field.aabb.tolist(), leaf.crops[-1].object_to_shape)
+        lies = ",".join(f"{number:.4g}" for number in box)
+        raise InvalidInput(
+            f"{where}: its crop holds nothing of it; in the frame of the node that is cropped it lies within "
+            f"{lies}; give a box or a sphere that reaches into that"
+        )
     return shown
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 
-from fusedrf_cli.engine.kinds.builder import StorageSetting
+from fusedrf_cli.engine.kinds.builder import EACH, StorageSetting
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.report import readable_size
 
@@ -36,7 +36,7 @@ class SearchConfig:
 
 def flags(kind: str, storage: StorageSetting, limit: int) -> str:
     """The flags of `fuse` that take a way of a kind to a size (bytes)."""
-    words = [f"--kind {kind}", f"--precision {storage.precision}"]
+    words = [f"--kind {kind}", *([f"--precision {storage.precision}"] if storage.precision != EACH else [])]
     words += [f"--ranks {storage.ranks[0]},{storage.ranks[1]}"] if storage.ranks is not None else []
     words += [f"--sh-degree {storage.sh_degree}"] if storage.sh_degree is not None else []
     return " ".join([*words, f"--max-size {limit}"])

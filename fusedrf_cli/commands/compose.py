@@ -72,7 +72,8 @@ def command(inputs, output, overwrite, composition, allow_outside, progress, **p
 
     Each INPUT, a bundle or a scene.json, is followed by the options that place it: it is scaled, then
     turned, then moved, in whatever order these are given. Nothing is optimised. Sources are written relative
-    to the scene's folder.
+    to the scene's folder. An INPUT that is a scene is a group: its fields are one by its own --composition,
+    and that one is placed.
 
     \b
     Example:

@@ -14,7 +14,7 @@ from fusedrf_cli.option_types import FieldKindType, InputType
 )
 @options.max_size
 @options.smallest
-@options.time_budget
+@options.fused_time_budget
 @options.memory
 @options.fused_precision
 @options.ranks

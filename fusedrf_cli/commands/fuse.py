@@ -24,7 +24,7 @@ def brief(report: dict) -> dict:
 )
 @options.fused_max_size
 @options.smallest
-@options.time_budget
+@options.fused_time_budget
 @options.finetune
 @click.option("--from-scratch", is_flag=True, help="Do not start from the background's weights.")
 @click.option(

@@ -85,6 +85,7 @@ def command(**words):
     cameras are counted. Of a fused bundle the objects are listed with kind, position, size in the world and
     bytes; an object that was distilled into one field with others has no bytes of its own, but the node
     of that field inside which it is. Damage is found, but arrays are not decoded, so the answer is quick.
+    With --json a node has its box in its own frame too, "aabb", which crops are in.
 
     \b
     Example:

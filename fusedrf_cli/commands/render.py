@@ -9,7 +9,9 @@ from fusedrf_cli.requests import RenderRequest
 
 @click.command("render")
 @click.argument("scene", type=InputType(stdin=True))
-@options.writing("A .png (one view), a folder (one PNG per view), or a .gif or .mp4 (a film).")
+@options.writing(
+    "A .png (one view), a folder (one PNG per view; no ending, or OUT/), or a .gif or .mp4 (a film)."
+)
 @click.option("--cameras", type=InputType(), help="Views of a transforms.json.")
 @click.option("--path", type=InputType(), help="Views of a nerfstudio camera_path.json.")
 @click.option(

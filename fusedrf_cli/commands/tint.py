@@ -6,7 +6,7 @@ from fusedrf_cli import options, verbs
 from fusedrf_cli.option_types import InputType, ShareType, TintType
 
 
-@click.command("tint")
+@click.command("tint", cls=options.NumbersCommand)
 @click.argument("fused", type=InputType())
 @click.argument("name")
 @click.argument("colour", metavar="[R,G,B]", type=TintType(), required=False)

@@ -26,8 +26,8 @@ from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.finetune import FinetuneConfig
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
+from fusedrf_cli.engine.kinds.allocation import AllocationConfig
 from fusedrf_cli.engine.kinds.builder import DistilConfig
-from fusedrf_cli.engine.kinds.instances import InstancesConfig
 from fusedrf_cli.engine.kinds.resampled import ResampledBuilder
 from fusedrf_cli.engine.kinds.sparse.builder import SparseBuilder
 from fusedrf_cli.engine.kinds.vm.builder import VMBuilderConfig
@@ -110,7 +110,7 @@ TINY = (
     TrainPresets(DRAFT, DRAFT, DRAFT, DRAFT),
     TinySettings(),
     FinetuneConfig(rays=15_000, steps=30, rays_per_step=500),
-    InstancesConfig(ranks=(None,)),  # others would be compiled
+    AllocationConfig(ranks=()),  # others would be compiled
 )
 """Coarse grids, few steps, and few pictures to judge by."""
 

@@ -36,7 +36,7 @@ def charted(shop, tmp_path_factory):
     folder = shutil.copytree(shop, tmp_path_factory.mktemp("charted") / "shop")
     module, made = part("charting"), []
     one = ("float16",)
-    sweep = InstancesConfig((None,), ladder_precisions=one, ladder_finished=one, ladder_ranks=(None,))
+    sweep = InstancesConfig(ladder_precisions=one, ladder_finished=one, ladder_ranks=(None,))
     with pytest.MonkeyPatch.context() as patch, using(sweep):
 
         def noted(*words):

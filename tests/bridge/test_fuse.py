@@ -1,15 +1,22 @@
 """`fuse` for real: blocks, a distilled tensor, limits, and what is refused."""
 
 import json
+import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from formats import bundle
 from formats.bundle import read_bundle
 from formats.scene import SceneGraph, make_node, write_scene
+from fusedrf_cli.bridge.fusing import FusingConfig
+from fusedrf_cli.bridge.sources import load_to_fuse
 from fusedrf_cli.engine.rendering.metrics import PSNR_CAP, psnr
+from fusedrf_cli.engine.settings import using
+from fusedrf_cli.progress import NullProgress
+from fusedrf_cli.requests import FuseRequest
 from tests.bridge.conftest import done, part, write_scene_of
 
 VM = ("--kind", "vm", "--no-finetune", "--max-size", "300kB")
@@ -67,6 +74,32 @@ def test_the_file_is_no_larger_than_asked(report, folder, kind):
         "fuse", "pair.json", "-o", "less.rfpack", "--kind", kind, "--no-finetune", "--max-size", str(limit)
     )
     assert said["bytes"] <= limit and (kind == "vm" or said["bytes"] < whole)
+
+
+def test_a_default_limit_in_the_way_is_said(report):
+    """With the size that would keep the sources, and only where nothing else changes them."""
+    whole = report("fuse", "pair.json", "-o", "whole.rfpack")
+    with using(FusingConfig(default_max_size=whole["bytes"] // 2)):
+        said = report("fuse", "pair.json", "-o", "less.rfpack", "--no-finetune")["warnings"][-1]
+        size = re.search("--max-size ([0-9]+MB) would keep the sources as they are", said)[1]
+        again = report("fuse", "pair.json", "-o", "again.rfpack", "--max-size", size)
+        coarse = report("fuse", "pair.json", "-o", "coarse.rfpack", "--precision", "int4", "--no-finetune")
+    assert again["bytes"] == whole["bytes"] and not whole["warnings"] and not again["warnings"]
+    assert not any("would keep" in warning for warning in coarse["warnings"])
+
+
+def test_total_seconds_count_reading(folder, monkeypatch):
+    """By a clock that moves while sources are read alone."""
+    monkeypatch.chdir(folder)
+    now, fusing = [0.0], part("fusing")
+    monkeypatch.setattr(fusing, "time", SimpleNamespace(monotonic=lambda: now[0]))
+
+    def load(*words):
+        now[0] = 100.0
+        return load_to_fuse(*words)
+
+    request = FuseRequest(scene="pair.json", output="out.rfpack")
+    assert fusing.fuse(request, NullProgress(), load=load)["total_seconds"] == 100
 
 
 def test_a_scene_that_adds_up_stays_its_nodes(report, run, folder):

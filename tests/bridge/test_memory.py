@@ -108,8 +108,10 @@ def test_by_default_the_limit_is_what_is_free(monkeypatch):
     monkeypatch.setattr(memory, "available", lambda: 1_000_000)
     found = Memory()
     assert found.limit == found.base + 800_000
+    assert found.report()["predicted_bytes"] is None  # nothing was expected yet
     with pytest.raises(ResourceProblem, match="are to be had"):
         found.expect({"much": 1e9}, advice="ask for less")
+    assert found.report()["predicted_bytes"] > 1e9
 
 
 def test_what_is_free_heeds_a_control_group(monkeypatch):

@@ -309,9 +309,15 @@ def test_answers_are_those_of_the_composition_before_and_after(folder, report):
             ("move", "four.rfpack", "chair", "-t", "1,0,0"),
             "there is no 'chair'; it holds cp, dense, sparse, vm",
         ),
-        (("rename", "four.rfpack", "cp", "vm"), "there is a 'vm' already"),
+        (
+            ("rename", "four.rfpack", "cp", "vm"),
+            "there is a 'vm' already; choose another name, or rename or delete",
+        ),
         (("delete", "four.rfpack", "cp", "dense", "sparse", "vm"), "would leave nothing"),
-        (("crop", "four.rfpack", "cp", "50,50,50,1"), "its crop holds nothing of it"),
+        (
+            ("crop", "four.rfpack", "cp", "50,50,50,1"),
+            "its crop holds nothing of it; in the frame of the node that is cropped it lies within -",
+        ),
         (("add", "four.rfpack", "gone.rfpack", "--name", "x"), "no such file"),
     ],
 )

@@ -42,6 +42,28 @@ def test_info_for_people_shows_the_fields(run):
     assert any(line.endswith(" 96") and "fields/" in line for line in lines)
 
 
+def test_info_says_what_of_a_scene_no_command_takes(run, folder):
+    (folder / "frames").mkdir()
+    sources = {"gone": "gone.rfpack", "folder": "frames", "chair": "chair.rfpack", "far": "../a.rfpack"}
+    nodes = [{"name": name, "source": source} for name, source in sources.items()]
+    scene = {"format": "rfpack", "version": "1.0", "nodes": nodes}
+    said = json.loads(run("info", "-", "--json", stdin=json.dumps(scene)).stdout)["notes"]
+    (folder / "scene.json").write_text(json.dumps(scene))
+    result = run("info", "scene.json")
+    assert result.exit_code == 0 and [line.strip() for line in result.stdout.splitlines()[-3:]] == [
+        f"scene.json: node 'gone': source 'gone.rfpack' does not exist; put it at {folder / 'gone.rfpack'}, "
+        "or name another source",
+        "scene.json: node 'folder': source 'frames' is no bundle and no scene; train it to a .rfpack first",
+        "scene.json: node 'far': source '../a.rfpack' leads out of the scene's folder; move the file in, or "
+        "give --allow-outside",
+    ]
+    assert [note.removeprefix("standard input") for note in said] == [
+        line.strip().removeprefix("scene.json") for line in result.stdout.splitlines()[-3:]
+    ]
+    (folder / "scene.json").write_text(json.dumps(scene | {"nodes": [{"name": "a"}]}))
+    assert "the scene places nothing; give a node a 'source'" in run("info", "scene.json").stdout
+
+
 def test_info_of_rubbish_is_one_line(run, folder):
     (folder / "rubbish").write_bytes(b"\x00" * 100)
     result = run("info", "rubbish")

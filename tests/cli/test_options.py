@@ -208,6 +208,38 @@ def test_delete_hands_on_its_names(run, bridge):
 
 
 @pytest.mark.parametrize(
+    "words, shape",
+    [
+        (("-1,-1,0,1,1,1", "-o", "out"), (-1, -1, 0, 1, 1, 1)),
+        (("-o", "out", "-.5,0,0,2"), (-0.5, 0, 0, 2)),
+        (("-o", "out", "--", "-1,0,0,2"), (-1, 0, 0, 2)),
+        (("-o", "out"), None),
+    ],
+)
+def test_a_shape_may_begin_with_a_minus_sign(run, bridge, words, shape):
+    assert run("crop", "chair.rfpack", "a", *words).exit_code == 0
+    assert bridge.call[1]["shape"] == shape
+    assert "No such option '-x'" in run("crop", "chair.rfpack", "a", "-x", *words).stderr
+    assert "red, green and blue from 0 to 1" in run("tint", "chair.rfpack", "a", "-1,0,0", "-o", "t").stderr
+    assert run("move", "chair.rfpack", "a", "-t", "-1,0,0", "-o", "m").exit_code == 0
+    assert bridge.call[1]["translate"] == (-1, 0, 0)
+
+
+@pytest.mark.parametrize(
+    "words, says",
+    [
+        (("delete", "chair.rfpack", "a", "b", "a"), "a: is to be deleted twice; give each name once"),
+        (("rename", "chair.rfpack", "a", "a"), "'a' is its name already; give a new one"),
+        (("rename", "chair.rfpack", "a", ""), "node name '' is no name; give one of at least one"),
+        (("fuse", ""), "'SCENE' is an empty path; give that of a file"),
+    ],
+)
+def test_names_and_paths_that_cannot_be(run, bridge, words, says):
+    result = run(*words, "-o", "out.rfpack")
+    assert result.exit_code in (2, 3) and says in result.stderr and bridge.call is None
+
+
+@pytest.mark.parametrize(
     "colour, background", [("transparent", None), ("black", (0, 0, 0)), (None, (1.0, 1.0, 1.0))]
 )
 def test_render_hands_on_a_background(run, bridge, colour, background):
@@ -293,7 +325,8 @@ REPORT = {
     "output": "out.rfpack",
     "bytes": 1_234_567,
     "seconds": {"load": 0.5, "learn": 61.25},
-    "psnr": {"before_rgb": 31.234567, "after_rgb": float("inf"), "views": 4},
+    "psnr": {"before_rgb": 31.234567, "after_rgb": float("inf"), "stored": None, "views": 4},
+    "generator": "",
     "holdout": None,
     "views": [{"name": "r_0", "psnr": 30.5}, {"name": "r_10", "psnr": np.float32(31.5)}],
 }
@@ -309,6 +342,13 @@ def test_a_report_for_people_has_units(run, bridge):
         "  name  psnr",
         "  r_0   30.5 dB",
         "  r_10  31.5 dB",
+    ]
+    bridge.report = {"psnr": {"covered": 22.5, "covered_share": 0.5, "worst": {"name": "a", "bytes": 2000}}}
+    assert run("fuse", "chair.rfpack", "-o", "out.rfpack").stdout.splitlines() == [
+        "psnr:",
+        "  covered: 22.5 dB",
+        "  covered share: 0.5",
+        "  worst: name a, bytes 2 kB",
     ]
 
 

@@ -117,6 +117,35 @@ def test_two_outputs_of_one_name_are_refused(refused):
     assert code == 2 and "two outputs" in said
 
 
+@pytest.mark.parametrize(
+    "words, says",
+    [
+        (
+            ("render", *FUSED[:2], "out.jpg"),
+            "no .jpg is written; give a name that ends in .png, .gif, .mp4, or",
+        ),
+        (("chart", *FUSED[:2], "out.svg"), "no .svg is written; give a folder"),
+        (("extract", *FUSED, "--box", "0,0,0,1,1,1", "--preview", "a.webp"), "no .webp is written"),
+    ],
+)
+def test_names_of_files_that_are_not_written_make_no_folders(refused, words, says):
+    code, said = refused(*words)
+    assert code == 2 and says in said and "ends in a slash" in said
+
+
+@pytest.mark.parametrize("output", ["out", "out.jpg/", "there.jpg", "v1.5", "out.PNG"])
+def test_names_of_folders_and_of_files_that_are_written(run, bridge, folder, output):
+    (folder / "there.jpg").mkdir()
+    assert run("render", *FUSED[:2], output).exit_code == 0 and bridge.call[1]["output"] == output
+
+
+def test_an_output_has_a_name(refused):
+    assert refused("fuse", "chair.rfpack", "-o", "") == (
+        5,
+        "Error: the path of the output is empty; name a file\n",
+    )
+
+
 def test_a_dash_is_a_file_where_it_is_not_stdout(refused, folder):
     (folder / "-").write_text("mine")
     assert refused("fuse", "chair.rfpack", "-o", "-")[0] == 1

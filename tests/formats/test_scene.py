@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import time
 import unicodedata
 import warnings
@@ -244,6 +245,34 @@ def test_refused(data, error):
     assert type(caught.value) is error and str(caught.value).isprintable()
 
 
+def test_the_group_of_the_page_is_one():
+    """docs/how-fusing-works.md shows how a scene with a group is written."""
+    page = (Path(__file__).parents[2] / "docs/how-fusing-works.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```json\n(.*?)```", page, re.DOTALL)
+    scene = parse_scene(block.encode(), "the page")
+    assert [leaf.groups for leaf in scene.leaves()] == [(), *[(("fountain", "add"),)] * 2]
+    again = parse_scene(dump_scene(scene), "again")  # by the version and features that the page names
+    assert (again.nodes, again.version) == (scene.nodes, scene.version)
+    assert json.loads(dump_scene(scene))["requires"] == json.loads(block)["requires"]
+
+
+@pytest.mark.parametrize(
+    "content, says",
+    [
+        (
+            node(nodes=[]),
+            "node 'n' has the word 'nodes', expected some of name, field, source, .*, children$",
+        ),
+        (node(children=[{"name": "c", "sorce": "a"}]), "node 'c' has the word 'sorce', expected some of"),
+        (node(scale=[1, 1, 0]), r"node 'n': scale \[1.0, 1.0, 0.0\] is not three numbers, none of them 0$"),
+        (node(name="é" * 200), "node name 'é+…' has 400 bytes; give one of at most 255$"),
+    ],
+)
+def test_a_sentence_says_what_was_expected(content, says):
+    with pytest.raises(errors.FormatError, match=f"^here: {says}"):
+        parse_scene(content, "here")
+
+
 def test_limits_themselves_are_accepted_at_once():
     began = time.process_time()
     assert len(parse_scene(nested(MAX_DEPTH), "here").nodes) == 1
@@ -393,8 +422,10 @@ def test_sources_inside(folder, source):
 
 def test_sources_that_are_not_there(folder):
     for source in ("absent", "a" * 3000):
-        with pytest.raises(errors.MissingFile):
-            resolve_source(folder / "scene.json", source)
+        with pytest.raises(errors.MissingFile, match="node 'n': source 'a"):
+            resolve_source(folder / "scene.json", source, node="n")
+    with pytest.raises(errors.MissingFile, match=f"; put it at {folder}/absent, or name another source"):
+        resolve_source(folder / "scene.json", "absent")
     for source in ("", "a\0b", "a\nb"):
         with pytest.raises(errors.BadName):
             resolve_source(folder / "scene.json", source)

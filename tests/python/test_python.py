@@ -42,13 +42,26 @@ def folder(tmp_path, monkeypatch, in_force) -> Path:
 
 def write(folder: Path, file: str, places: dict) -> None:
     nodes = [
-        make_node(name, source=f"{name.split('-')[0]}.rfpack", translation=place, background=name == "grey")
+        make_node(
+            name,
+            source=f"{name.split('-')[0]}.rfpack",
+            translation=place,
+            background=name in ("grey", "ground"),
+        )
         for name, place in places.items()
     ]
     write_scene(folder / file, SceneGraph(tuple(nodes), extras={"author": "me"}))
 
 
-def test_the_page_runs_as_it_is_written():
+README = {"ground": (0, 0, 0), "tower": (-0.8, 0.4, 0.3), "small": (0.9, 0.8, 0.3), "ball": (0.6, -0.7, 0.46)}
+"""The scene of its five lines, of soft balls."""
+
+
+def test_the_page_runs_as_it_is_written(folder):
+    for name, colour in zip(README, ("grey", "blue", "blue", "red"), strict=True):
+        (folder / f"{name}.rfpack").hardlink_to(folder / f"{colour}.rfpack")
+    (folder / "scene.json").unlink()
+    write(folder, "scene.json", README)
     torch.manual_seed(0)
     names = {}
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
@@ -68,7 +81,7 @@ def test_the_page_runs_as_it_is_written():
     assert across.norm() < 0.04  # it was 0.066
     again, scene = names["again"], names["scene"]
     assert names["size"] == Path("learnt.rfpack").stat().st_size and again.names == scene.names
-    torch.testing.assert_close(again.placements["red"], scene.placements["red"].detach())
+    torch.testing.assert_close(again.placements["ball"], scene.placements["ball"].detach())
 
 
 def test_a_picture_is_that_of_the_command_line():

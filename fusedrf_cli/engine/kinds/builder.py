@@ -45,6 +45,7 @@ class BuilderConfig:
     """Four objects in 24 million: 36.4 dB by one lesson, 36.9 by twice the steps, 38.1 by all."""
 
 
+EACH = "each"  # in place of a precision: every field of a scene has one of its own
 NOTHING = "nothing"  # what a student starts from that takes over no numbers
 
 
@@ -60,6 +61,12 @@ class StorageSetting:
     """SH degree at most; None: as the kind or the sources have it."""
     hashed: HashGrid | None = None
     """What is finer than the grid, of kinds that can have it."""
+    each: tuple[str, ...] = ()
+    """Of the distinct fields of a scene, where each has a precision of its own; "": its source's bytes."""
+
+    def precision_of(self, i: int) -> str:
+        """Of the i-th distinct field of a scene."""
+        return self.each[i] if self.each else self.precision
 
 
 @dataclass(frozen=True)
@@ -230,6 +237,10 @@ class Candidate:
     """Whether more bytes would change nothing."""
     exact: bool = False
     """Whether it shows what the scene does, so that it has nothing to learn."""
+    storage: StorageSetting | None = None
+    """With the precision of each field; None: as it was asked for."""
+    settled: frozenset[int] = frozenset()
+    """Those of its fields, by their ids, that answer as their sources do but for their precision."""
 
 
 @dataclass(frozen=True)
@@ -412,3 +423,7 @@ class DirectBuilder(DistilledBuilder):
     def smallest(self) -> int:
         """Bytes of the file with the coarsest student."""
         raise NotImplementedError
+
+    def judged_by(self, error_of: Callable[[StoredField, StoredField, str | None], float]) -> None:
+        """Told what says how far a field that was made of a source shows from it, as it is stored in a
+        precision or, where that is None, as it is: mean square of colours along rays."""

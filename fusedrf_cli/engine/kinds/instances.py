@@ -2,18 +2,19 @@
 where that fits, else with coarser texels, fewer components or SH bands. What that costs each of them learns
 again from rays of its source."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.resolution_report import ResolutionReport, extent
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
-from fusedrf_cli.engine.fields.occupancy import squeezed
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.allocation import FieldShares, allocated
 from fusedrf_cli.engine.kinds.builder import (
+    EACH,
     BuildRequest,
     Candidate,
     DirectBuilder,
@@ -32,15 +33,10 @@ from fusedrf_cli.engine.settings import current
 class InstancesConfig:
     """How sources are made smaller, and which ways a chart tries."""
 
-    ranks: tuple[tuple[int, int] | None, ...] = ((8, 16), (8, 24), None)
-    """That are compared where none are asked for. Fewer density components cost least and fewer colour
-    components most (docs/how-fusing-works.md)."""
     copies: float = 8.5
     """Of a source while it is made smaller: sections in float64 before and after, most of them."""
-    finer: float = 1 / 8
-    """Of the finest voxel: with a stretched instance a common voxel may lie under it."""
-    tolerance: float = 1 + 1e-4
-    """To which a common voxel is found."""
+    resampled: float = 1.3
+    """Of all numbers of a grid, those of empty cells too, while it is resampled."""
     ladder_ranks: tuple[tuple[int, int] | None, ...] = (None, (8, 24), (8, 16))
     ladder_precisions: tuple[str, ...] = ("int8", "float16", "int4")
     ladder_finished: tuple[str, ...] = ("int8", "int4")
@@ -90,7 +86,7 @@ class InstancesKind(Kind):
 
 
 class InstancesBuilder(DirectBuilder):
-    """The fields of a scene, made smaller by one common voxel until they fit."""
+    """The fields of a scene, each made smaller by what costs least, until they fit."""
 
     distil_config = None
     gain = 5.0  # dB, the most that was seen
@@ -98,23 +94,23 @@ class InstancesBuilder(DirectBuilder):
     def __init__(self, kind: InstancesKind, scene: ComposedField, request: BuildRequest):
         super().__init__(kind, scene, request)
         self.fields = distinct_fields(scene)
-        self.placed = [[p for p in scene.leaves() if p.field is field] for field in self.fields]
         self.kinds = [registry.kind(field.kind) for field in self.fields]
-        # once, since a source that memory does not hold is read again whenever it is opened
-        pairs = zip(self.kinds, self.fields, strict=True)
-        self.outlines = [kind.outline(opened(field)) for kind, field in pairs]
+        self.outlines, self.largest_grid = [], 0
+        for kind, field in zip(self.kinds, self.fields, strict=True):
+            own = opened(field)  # once: what memory does not hold is read again whenever it is opened
+            self.outlines.append(kind.outline(own))
+            self.largest_grid = max(self.largest_grid, own.params.numel())
         self._exactly: dict[tuple[int, str], int] = {}
+        self._shares: dict[StorageSetting, list[FieldShares]] = {}
+
+    def plain(self) -> StorageSetting:
+        """See `DirectBuilder`: where no precision is asked for, each field has one of its own."""
+        request = self.request
+        return StorageSetting(request.precision or EACH, request.ranks, request.sh_degree)
 
     def storage_settings(self) -> list[list[StorageSetting]]:
-        """By precision, and ranks, where any of the fields has such."""
-        request = self.request
-        precisions = (request.precision,) if request.precision else self.kind.precisions
-        ranked = any("ranks" in kind.reduces for kind in self.kinds)
-        if request.ranks or not ranked:
-            ranks = (request.ranks,)
-        else:
-            ranks = current(InstancesConfig).ranks
-        return [[StorageSetting(p, r, request.sh_degree) for r in ranks] for p in precisions]
+        """Bytes are shared out among the fields, so that there is nothing to compare."""
+        return [[self.plain()]]
 
     def unchanged(self) -> Candidate | None:
         """See `DistilledBuilder`: with the bytes of the sources."""
@@ -124,31 +120,34 @@ class InstancesBuilder(DirectBuilder):
         return Candidate(self.scene, size, True, True) if size is not None and size <= request.limit else None
 
     def build(self, storage: StorageSetting, limit: int) -> Candidate | None:
-        """The fields, as far as the limit and the way need it with fewer numbers. One whose own bytes are no
-        more than those of its numbers in the way's precision keeps them."""
-        reductions, size = self.fitting(storage, limit)
+        """The fields, each with its share of the bytes."""
+        fields = self.shares(storage)
+        shares = allocated(fields, limit - self.request.overhead)
+        pairs = list(zip(fields, shares, strict=True))
+        size = self.request.overhead + sum(field.bytes(share) for field, share in pairs)
         if size > limit:
             return None
-        lossless = all(one.lossless for one in reductions)
-        if lossless and storage == StorageSetting(self.kind.faithful) and self.fits_as_it_is(limit):
-            return Candidate(self.scene, self.bytes_as_they_are, True, True)
-        by_field = {id(f): i for i, f in enumerate(self.fields)}
+        lossless = all(field.reduction(share).lossless for field, share in pairs)
+        whole = lossless and all(share == field.whole for field, share in pairs)
+        by_field, settled = {id(f): i for i, f in enumerate(self.fields)}, set()
 
         def smaller(field: RadianceField) -> RadianceField:
-            i = by_field[id(field)]
-            if self.keeps_bytes(i, reductions[i], storage):
+            own, share = pairs[by_field[id(field)]]
+            if share.precision is None:
                 return field
-            return reductions[i].make(opened(field).to("cpu"))
+            reduction = own.reduction(share)
+            made = reduction.make(opened(field).to("cpu"))
+            if reduction.lossless:  # a field of its own, since what is stored anew is not its source
+                made = made.with_params(made.params)
+                settled.add(id(made))
+            return made
 
         try:
-            return Candidate(self.scene.with_fields(smaller), size, lossless, lossless)
+            scene = self.scene.with_fields(smaller)
         except TooSmall:
             return None
-
-    def fits_as_it_is(self, limit: int) -> bool:
-        """Whether the fields with their own bytes are no larger than a limit."""
-        size = None if self.request.precision else self.bytes_as_they_are
-        return size is not None and size <= limit
+        precisions = tuple(share.precision or "" for share in shares)
+        return Candidate(scene, size, whole, lossless, replace(storage, each=precisions), frozenset(settled))
 
     @cached_property
     def bytes_as_they_are(self) -> int | None:
@@ -158,84 +157,68 @@ class InstancesBuilder(DirectBuilder):
 
     # -- bytes -----------------------------------------------------------------------------------------------
 
-    def keeps_bytes(self, i: int, reduction: Reduction, storage: StorageSetting) -> bool:
-        """Whether the i-th field stays as its source has it."""
-        own = self.request.stored_bytes.get(id(self.fields[i]))
-        free = reduction.lossless and self.request.precision is None and own is not None
-        return free and own <= self.bytes_at(i, reduction, storage)
+    def shares(self, storage: StorageSetting) -> list[FieldShares]:
+        """What the fields take, and what they lose by it, in a way; made once."""
+        if storage not in self._shares:
+            self._shares[storage] = [self.shares_of(i, storage) for i in range(len(self.fields))]
+        return self._shares[storage]
 
-    def bytes_at(self, i: int, reduction: Reduction, storage: StorageSetting) -> int:
-        """At most so many bytes for the numbers of the i-th field in a way's precision."""
+    def shares_of(self, i: int, storage: StorageSetting) -> FieldShares:
+        """Of the i-th field."""
+        kind, outline, field = self.kinds[i], self.outlines[i], self.fields[i]
+        own = self.request.stored_bytes.get(id(field))
+        as_asked = kind.reduction(outline, 0.0, storage)
+        ladder = [storage.precision] if storage.precision != EACH else list(reversed(self.kind.precisions))
+        if own is not None and storage.precision == EACH and as_asked.lossless:
+            ladder = [None, *(p for p in ladder if self.bytes_at(i, as_asked, p) < own)]
+
+        def bytes_at(reduction: Reduction, precision: str | None) -> int:
+            if precision is not None:
+                return self.bytes_at(i, reduction, precision)
+            return own if reduction.lossless else 1 << 62  # numbers that are made anew are stored anew
+
+        def error_of(reduction: Reduction, precision: str | None) -> float:
+            if reduction.lossless and precision is None:
+                return 0.0
+            made = reduction.make(opened(field).to("cpu"))
+            return self.error_of(field, made, precision)
+
+        ranked = storage.ranks is None and "ranks" in kind.reduces
+        return FieldShares(
+            lambda voxel, how: kind.reduction(outline, voxel, how),
+            bytes_at, error_of, float(outline.voxel_size), storage, ladder, ranked,
+        )  # fmt: skip
+
+    def judged_by(self, error_of: Callable[[StoredField, StoredField, str | None], float]) -> None:
+        """See `DirectBuilder`."""
+        self.error_of = error_of
+
+    def bytes_at(self, i: int, reduction: Reduction, precision: str) -> int:
+        """At most so many bytes for the numbers of the i-th field in a precision."""
         if reduction.contents is not None:
-            return self.request.sizes.of(reduction.contents, storage.precision)
-        key = i, storage.precision
+            return self.request.sizes.of(reduction.contents, precision)
+        key = i, precision
         if key not in self._exactly:
-            self._exactly[key] = self.request.sizes.exactly(
-                opened(self.fields[i]).to("cpu"), storage.precision
-            )
+            self._exactly[key] = self.request.sizes.exactly(opened(self.fields[i]).to("cpu"), precision)
         return self._exactly[key]
-
-    def bytes_with(self, reductions: Sequence[Reduction], storage: StorageSetting) -> int:
-        """At most so many bytes of the file."""
-        total = self.request.overhead
-        for i, one in enumerate(reductions):
-            kept = self.keeps_bytes(i, one, storage)
-            total += self.request.stored_bytes[id(self.fields[i])] if kept else self.bytes_at(i, one, storage)
-        return total
 
     def bytes_of(self, field: ComposedField, storage: StorageSetting) -> int:
         """See `DistilledBuilder`."""
         total = self.request.overhead
-        for source, one in zip(self.fields, distinct_fields(field), strict=True):
+        for i, (source, one) in enumerate(zip(self.fields, distinct_fields(field), strict=True)):
             if one is source:
                 total += self.request.stored_bytes[id(source)]
             else:
-                kind = registry.kind(one.kind)
-                reduction = kind.reduction(kind.outline(one), 0.0, StorageSetting(storage.precision))
+                kind, precision = registry.kind(one.kind), storage.precision_of(i)
+                reduction = kind.reduction(kind.outline(one), 0.0, StorageSetting(precision))
                 sizes, contents = self.request.sizes, reduction.contents
                 known = contents is not None
-                total += (
-                    sizes.of(contents, storage.precision) if known else sizes.exactly(one, storage.precision)
-                )
+                total += sizes.of(contents, precision) if known else sizes.exactly(one, precision)
         return total
-
-    def fitting(self, storage: StorageSetting, limit: int) -> tuple[list[Reduction], int]:
-        """The fields at their own resolution, or at that of the finest common voxel, in the scene's frame, at
-        which they fit in so many bytes, as far as that goes; and how many they take."""
-
-        config = current(InstancesConfig)
-
-        def at_voxel(voxel: float) -> tuple[list[Reduction], int]:
-            fields = [
-                kind.reduction(outline, voxel / stretch, storage)
-                for kind, outline, stretch in zip(self.kinds, self.outlines, self.stretches, strict=True)
-            ]
-            return fields, self.bytes_with(fields, storage)
-
-        best = at_voxel(0.0)
-        if best[1] <= limit:
-            return best
-        fine = config.finer * min(p.voxel_size for own in self.placed for p in own)
-        pairs = zip(self.outlines, self.stretches, strict=True)
-        coarse = max(float((o.aabb[3:] - o.aabb[:3]).max()) * stretch for o, stretch in pairs)
-        best = at_voxel(coarse)
-        while coarse > config.tolerance * fine and best[1] <= limit:
-            middle = (fine * coarse) ** 0.5
-            fields = at_voxel(middle)
-            if fields[1] <= limit:
-                best, coarse = fields, middle
-            else:
-                fine = middle
-        return best
-
-    @cached_property
-    def stretches(self) -> list[float]:
-        """For each field the most by which an instance of it is larger than itself."""
-        return [max(1 / squeezed(p.world_to_object) for p in own) for own in self.placed]
 
     def smallest(self) -> int:
         """See `DirectBuilder`."""
-        return min(self.fitting(storage, 1)[1] for group in self.storage_settings() for storage in group)
+        return self.request.overhead + sum(field.smallest() for field in self.shares(self.plain()))
 
     # -- telling ---------------------------------------------------------------------------------------------
 
@@ -244,12 +227,15 @@ class InstancesBuilder(DirectBuilder):
         return f"{len(field.leaves())} nodes over {len(self.fields)} fields, each in its own axes"
 
     def needs(self) -> MemoryEstimate:
-        """The sources' numbers as far as the limit lets them."""
+        """The sources' numbers as far as the limit lets them; a grid that is resampled uses all its pages."""
         request, per_number = self.request, self.request.sizes.per_number
         own = sum(request.source_bytes) // 4  # bytes
         cheapest = request.precision or self.kind.precisions[0]
+        config = current(InstancesConfig)
         return MemoryEstimate(
-            min(own, int(request.limit / per_number(cheapest))), current(InstancesConfig).copies
+            min(own, int(request.limit / per_number(cheapest))),
+            config.copies,
+            {"a grid while it is resampled": config.resampled * 4 * self.largest_grid},
         )
 
 

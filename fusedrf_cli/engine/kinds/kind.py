@@ -155,7 +155,7 @@ class Kind:
 
     def resolution_reports(self, scene: ComposedField, field: StoredField) -> list[ResolutionReport]:
         """What a field holds of the objects placed in a scene."""
-        return resolution_at_voxel(scene.placed, field.voxel_size)
+        return resolution_at_voxel(scene.leaves(), field.voxel_size)
 
     def field_memory(
         self, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads

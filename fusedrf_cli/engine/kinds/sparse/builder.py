@@ -130,7 +130,7 @@ class SparseKind(Kind):
         """What bricks hold of placed objects."""
         return [
             ResolutionReport(p.name, p.condition, opacity_off(p.condition), p.voxel_size, v, extent(p) / v)
-            for p, v in zip(scene.placed, held_voxels(scene, field), strict=True)
+            for p, v in zip(scene.leaves(), held_voxels(scene, field), strict=True)
         ]
 
     def sweeps(self, least_psnr: float) -> dict[str, list[Sweep]]:
@@ -264,7 +264,7 @@ def levels(field: SparseField) -> list[dict]:
 def held_voxels(scene: ComposedField, field: SparseField) -> list[float]:
     """The side of the voxels that hold most of each placed object."""
     tree, voxels = field.tree, []
-    for p in scene.placed:
+    for p in scene.leaves():
         centres = p.field.occupancy.centres() @ p.object_to_world[:3, :3].T + p.object_to_world[:3, 3]
         halves = 2 * np.floor((centres - tree.lo) / tree.unit).astype(np.int64) + 1
         inside = ((halves > 0) & (halves < 2 * (field.aabb[3:] - tree.lo) / tree.unit)).all(1)

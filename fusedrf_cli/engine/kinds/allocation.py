@@ -1,0 +1,154 @@
+"""Bytes shared out among the fields of a scene: each gets the precision, texels and components with which all
+of them fit in a limit at the least error. Of what a field may lose, that goes first which saves most bytes
+for the error that it adds (greedy allocation of bits; Shoham and Gersho 1988)."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from math import exp, log
+
+from fusedrf_cli.engine.kinds.builder import StorageSetting
+from fusedrf_cli.engine.kinds.reduction import Reduction
+from fusedrf_cli.engine.settings import current
+
+
+@dataclass(frozen=True)
+class AllocationConfig:
+    """What fields may lose."""
+
+    ranks: tuple[tuple[int, int], ...] = ((8, 24), (8, 16))
+    """Of components, one after the other: fewer for density cost least and fewer for colour most
+    (docs/how-fusing-works.md)."""
+    voxel_step: float = 2 ** (1 / 4)
+    """From one spacing of texels to the next."""
+    most_steps: int = 32
+    """Of that, to 256 times the spacing."""
+    measured_steps: tuple[int, ...] = (2, 4, 8, 12, 16, 24, 32)
+    """At which the error is measured; between them it is a power of the spacing."""
+    least_error: float = 1e-9
+    """Mean square: what lies under it cannot be seen."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """How one field is stored."""
+
+    precision: str | None
+    """None: with the bytes of its source."""
+    steps: int = 0
+    """By which its texels are wider."""
+    ranks: tuple[int, int] | None = None
+    """At most so many components; None: its own."""
+
+
+class FieldShares:
+    """What one field takes, and how far it shows from itself, by its share."""
+
+    def __init__(
+        self,
+        reduction: Callable[[float, StorageSetting], Reduction],
+        bytes_at: Callable[[Reduction, str | None], int],
+        error_of: Callable[[Reduction, str | None], float],
+        voxel: float,
+        asked: StorageSetting,
+        ladder: Sequence[str | None],
+        ranked: bool,
+    ):
+        """reduction: of a spacing of texels and components. bytes_at and error_of: of a field so reduced in a
+        precision. voxel: the field's spacing. asked: ranks and SH degree at most. ladder: the precisions that
+        are free, from the dearest to the cheapest, None for the source's own bytes. ranked: whether fewer
+        components than those asked for may be tried."""
+        self.voxel, self.asked, self.ladder, self.ranked = voxel, asked, ladder, ranked
+        self._reduction = cache(reduction)
+        self.bytes = cache(lambda share: bytes_at(self.reduction(share), share.precision))
+        """At most so many bytes with a share."""
+        self._error = cache(lambda share: error_of(self.reduction(share), share.precision))
+
+    @property
+    def whole(self) -> Share:
+        """All that it may have."""
+        return Share(self.ladder[0])
+
+    def reduction(self, share: Share) -> Reduction:
+        """What makes the field of a share, but for its precision."""
+        voxel = self.voxel * current(AllocationConfig).voxel_step ** share.steps if share.steps else 0.0
+        return self._reduction(voxel, replace(self.asked, ranks=share.ranks or self.asked.ranks))
+
+    def error(self, share: Share) -> float:
+        """About so much mean square error: of its precision, its texels and its components, each measured by
+        itself."""
+        error = self._error(Share(share.precision))
+        if share.ranks is not None:
+            error += self._error(Share(None, 0, share.ranks))
+        return error + (self.coarsening_error(share.steps) if share.steps else 0.0)
+
+    def coarsening_error(self, steps: int) -> float:
+        """Of wider texels alone."""
+        config = current(AllocationConfig)
+
+        def measured(at: int) -> float:
+            return max(self._error(Share(None, at)), config.least_error)
+
+        after = next(at for at in config.measured_steps if at >= steps)
+        if after == steps:
+            return measured(after)
+        before = max((at for at in config.measured_steps if at < steps), default=0)
+        if not before:  # as its square, from nothing
+            return measured(after) * config.voxel_step ** (2 * (steps - after))
+        share = (steps - before) / (after - before)
+        return exp((1 - share) * log(measured(before)) + share * log(measured(after)))
+
+    def moves(self, share: Share) -> Iterator[Share]:
+        """Shares of fewer bytes: each next precision, spacing and number of components."""
+        config, size = current(AllocationConfig), self.bytes(share)
+        at = self.ladder.index(share.precision)
+        tried = [replace(share, precision=p) for p in self.ladder[at + 1 :]]
+        if self.ranked:
+            left = [r for r in config.ranks if share.ranks is None or r < share.ranks]
+            tried += [replace(share, ranks=r) for r in left[:1]]
+        wider = (replace(share, steps=n) for n in range(share.steps + 1, config.most_steps + 1))
+        tried += [one for one in [next((w for w in wider if self.bytes(w) < size), None)] if one]
+        yield from (one for one in tried if self.bytes(one) < size)
+
+    def smallest(self) -> int:
+        """Bytes of the least share."""
+        config = current(AllocationConfig)
+        ranks = config.ranks[-1] if self.ranked and config.ranks else None
+        return min(self.bytes(Share(p, config.most_steps, ranks)) for p in self.ladder)
+
+
+def allocated(fields: Sequence[FieldShares], limit: int) -> list[Share]:
+    """The shares with which the fields take no more than so many bytes, where any do."""
+    shares = [field.whole for field in fields]
+    sizes = [field.bytes(share) for field, share in zip(fields, shares, strict=True)]
+
+    def price(i: int, share: Share) -> float:
+        """The error that a share adds, for each byte that it saves."""
+        added = fields[i].error(share) - fields[i].error(shares[i])
+        return max(added, 0.0) / (sizes[i] - fields[i].bytes(share))
+
+    cheapest: dict[int, tuple[float, Share] | None] = {}
+    while sum(sizes) > limit:
+        for i, field in enumerate(fields):
+            if i not in cheapest:
+                moves = [(price(i, share), share) for share in field.moves(shares[i])]
+                cheapest[i] = min(moves, key=lambda move: move[0], default=None)
+        left = [i for i, move in cheapest.items() if move is not None]
+        if not left:
+            break
+        i = min(left, key=lambda i: cheapest[i][0])
+        shares[i] = cheapest.pop(i)[1]
+        sizes[i] = fields[i].bytes(shares[i])
+    return filled(fields, shares, sizes, limit)
+
+
+def filled(fields: Sequence[FieldShares], shares: list[Share], sizes: list[int], limit: int) -> list[Share]:
+    """The shares with texels as much finer as the bytes left over allow, those of the largest error first."""
+    for i in sorted(range(len(fields)), key=lambda i: -fields[i].error(shares[i])):
+        others = sum(sizes) - sizes[i]
+        while shares[i].steps:
+            finer = replace(shares[i], steps=shares[i].steps - 1)
+            if others + fields[i].bytes(finer) > limit:
+                break
+            shares[i], sizes[i] = finer, fields[i].bytes(finer)
+    return shares
