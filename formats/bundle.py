@@ -27,6 +27,7 @@ from formats.object_summary import objects_in, world_aabb
 from formats.records import (
     FieldHeader,
     FieldRecord,
+    StoredArrays,
     decode_field,
     decode_header,
     encode_field,
@@ -85,6 +86,10 @@ class FieldSet:
         """What a member stands for, which may have held several objects; nothing of one that is not here."""
         alone = (Instance("", False, member, np.eye(4), WHITE),) if member in self.headers else ()
         return self.instances.get(member, alone)
+
+    def arrays(self, member: str) -> StoredArrays:
+        """A field's own arrays, each decoded when it is asked for. Raises MissingMember."""
+        return StoredArrays(self.data(member), self.headers[member], f"{self.path}: {member}")
 
     def field(self, member: str) -> FieldRecord:
         """One field. Raises MissingMember, and as `decode_field`."""

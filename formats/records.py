@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -184,22 +185,42 @@ def decode_field(data: bytes | memoryview, where: str) -> FieldRecord:
     LimitExceeded, NewerVersion, NotFinite.
     """
     header = decode_header(data, where)
-    arrays = {}
-    for name in header.plain:
-        array = mapped_array(data, header.specs[name])
+    return FieldRecord(header.kind, dict(StoredArrays(data, header, where)), header.metadata)
+
+
+class StoredArrays(Mapping):
+    """The arrays of a field in its bytes, each decoded, as `decode_field` has it, when it is asked for."""
+
+    def __init__(self, data: bytes | memoryview, header: FieldHeader, where: str):
+        self.data, self.header, self.where = data, header, where
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.header.arrays)
+
+    def __len__(self) -> int:
+        return len(self.header.arrays)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.header.arrays
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        array = self._coded(name) if name in self.header.coded else self._plain(name)
+        give_back(self.data)
+        return array
+
+    def _plain(self, name: str) -> np.ndarray:
+        array = mapped_array(self.data, self.header.specs[name])
         array = array.astype(np.float32 if array.dtype.kind == "f" else array.dtype.newbyteorder("="))
-        _check_finite(name, array, where)
-        arrays[name] = array
-        give_back(data)
-    for name, spec in header.coded.items():
-        scales, codes = (mapped_array(data, header.specs[part]) for part in coded_parts(name))
-        runs = arrays[runs_of(name)] if spec.runs else None
-        array_where = f"{where}: array {name!r}"
+        _check_finite(name, array, self.where)
+        return array
+
+    def _coded(self, name: str) -> np.ndarray:
+        spec, where = self.header.coded[name], f"{self.where}: array {name!r}"
+        scales, codes = (mapped_array(self.data, self.header.specs[part]) for part in coded_parts(name))
+        runs = self._plain(runs_of(name)) if spec.runs else None
         if runs is not None:
-            _check_runs(runs, spec.shape[0], scales.shape[0], array_where)
-        arrays[name] = dequantised(scales, codes, spec.bits, spec.shape, array_where, runs)
-        give_back(data)
-    return FieldRecord(header.kind, arrays, header.metadata)
+            _check_runs(runs, spec.shape[0], scales.shape[0], where)
+        return dequantised(scales, codes, spec.bits, spec.shape, where, runs)
 
 
 def decode_header(data: bytes | memoryview, where: str, most: int = MAX_DECODED_BYTES) -> FieldHeader:

@@ -9,7 +9,7 @@ import numpy as np
 from formats.records import BYTES_PER_NUMBER
 from formats.scene import Leaf, SceneGraph
 from fusedrf_cli.bridge.editing import Draft
-from fusedrf_cli.bridge.memory import Memory, ownership, sources
+from fusedrf_cli.bridge.memory import ownership, sources
 from fusedrf_cli.bridge.scene import LoadedScene, grouped, make_field, part_shown
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField, occupied_at
@@ -58,16 +58,15 @@ class Whole:
     """The fields of nodes as they are stored, by the nodes' names."""
 
     @classmethod
-    def read(cls, path: str, memory: Memory) -> "Whole":
-        """The bundle at a path, with all its fields in memory."""
-        config = current(CuttingConfig)
-        draft = Draft(path, memory)
+    def read(cls, draft: Draft) -> "Whole":
+        """The bundle of a draft with a memory, with all its fields in it."""
+        config, path, memory = current(CuttingConfig), draft.path, draft.memory
         outside = [leaf for leaf in draft.graph.leaves() if leaf.field is None]
         if outside:
             raise InvalidInput(
                 f"{path}: its node '{outside[0].name}' names a source beside it; fuse it first"
             )
-        loaded = draft.before
+        loaded = draft.after()
         lone = loaded.lone()
         field, origin = lone or ((scene := as_composite(loaded.composed())), scene.origin)
         memory.expect(

@@ -2,7 +2,7 @@
 bytes."""
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -22,14 +22,15 @@ from formats.graph import (
 )
 from formats.history import check_history, distilled, summed_up
 from formats.records import FieldRecord
-from formats.scene import Node
+from formats.scene import Node, SceneGraph
 from formats.undo import keep
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.runtime import written_somewhere
-from fusedrf_cli.bridge.scene import LoadedScene, load_bundle
+from fusedrf_cli.bridge.scene import LoadedScene, load_bundle, outlines
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import enclosing
+from fusedrf_cli.engine.fields.streamed import StreamedField
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import (
     AddRequest,
@@ -52,11 +53,7 @@ class Draft:
         self.bundle = OpenBundle(path)
         check_history(self.bundle.scene, path)
         self.graph, self.writer = self.bundle.scene, BundleWriter()
-
-    @cached_property
-    def before(self) -> LoadedScene:
-        """The scene as it was; its fields are read when they are asked."""
-        return load_bundle(self.bundle, self.bundle.scene, self.memory, self.device)
+        self.outlined: dict[str, StreamedField] = {}
 
     @property
     def fields(self) -> FieldSet:
@@ -64,8 +61,15 @@ class Draft:
         return self.bundle.with_fields(self.writer.members)
 
     def after(self) -> LoadedScene:
-        """The scene as it is to be."""
+        """The scene as it is to be, with all its fields read."""
         return load_bundle(self.fields, self.graph, self.memory, self.device)
+
+    def box_in(self, graph: SceneGraph, names: Container[str] | None = None) -> np.ndarray | None:
+        """(6,) in the world around what leaves of such names show, None: all, of a graph over these fields;
+        None where that is nothing. Headers and grids tell it, but of what crops leave of a field."""
+        placed = outlines(self.fields, graph, self.memory, self.outlined)
+        boxes = [one.aabb for one in placed if names is None or belongs(one.name, names)]
+        return enclosing(boxes) if boxes else None
 
     def put(self, field: StoredField, precision: str) -> str:
         """The member that a field is stored as."""
@@ -110,7 +114,7 @@ class Draft:
         names = set(names)
         boxes = [np.asarray(self.inside[name]["aabb"]) for name in names & self.inside.keys()]
         nodes = chosen(self.bundle.scene, names - self.inside.keys())
-        around = box_of(self.before, leaf_names(nodes)) if nodes else None
+        around = self.box_in(self.bundle.scene, leaf_names(nodes)) if nodes else None
         boxes += [] if around is None else [around]
         return enclosing(boxes) if boxes else None
 
@@ -121,7 +125,7 @@ class Draft:
         scene = self.bundle.scene
         if scene.framing is not None or (scene.cameras or {}).get("surroundings"):
             return scene.framing
-        return tuple(box_of(self.before, {p.name for p in self.before.placed}).tolist())
+        return tuple(self.box_in(scene).tolist())
 
     def write(self, request: EditRequest, entry: dict, learnt: bool = False) -> int:
         """Write the bundle with one more entry of history; the bytes written. learnt: it took long."""
@@ -144,12 +148,6 @@ class Draft:
         return written_somewhere(request.output, write) if learnt else write(request.output)
 
 
-def box_of(scene: LoadedScene, names: set[str]) -> np.ndarray | None:
-    """(6,) in the world around what some leaves of a scene show; None where that is nothing."""
-    boxes = [p.aabb for p in scene.placed if belongs(p.name, names)]
-    return enclosing(boxes) if boxes else None
-
-
 # -- edits ---------------------------------------------------------------------------------------------------
 
 
@@ -161,6 +159,8 @@ class Edit:
         progress.phase("reading", None)
         self.memory = Memory(request.memory)
         self.draft = Draft(request.fused, self.memory, device)
+        copied = {"fields of a bundle of an earlier version": self.draft.bundle.copied}
+        self.memory.expect(copied, advice="allow more by --memory")
 
     def done(
         self,
@@ -176,7 +176,7 @@ class Edit:
         are nodes as they are now, others, by name, as they were, and boxes (6,) in the world."""
         draft, entry, boxes = self.draft, entry or {}, list(boxes)
         placements = [
-            box_of(draft.after(), leaf_names(nodes)) if nodes else None,
+            draft.box_in(draft.graph, leaf_names(nodes)) if nodes else None,
             draft.box(before) if before else None,
         ]
         boxes += [box for box in placements if box is not None]
@@ -210,12 +210,15 @@ def brought(
     matrix: np.ndarray,
     background: bool = False,
 ) -> Node:
-    """The scene of a request's source as a node of a draft, placed by a (4, 4). InvalidInput where it cannot
-    be one."""
+    """The scene of a request's source as a node of a draft, placed by a (4, 4). Its fields are read, so that
+    none comes that is malformed. InvalidInput where it cannot be one."""
     source = request.source
     embedding = Embedding(draft.writer, precision=request.precision)
     scene = embedding.scene(source)
     node = as_one(scene, name, matrix, draft.graph.composition, background)
     if not leaf_names([node]):
         raise InvalidInput(f"{source}: it holds no field; choose another source")
+    alone = replace(draft.graph, nodes=(node,))
+    if any(leaf.visible for leaf in alone.leaves()):
+        load_bundle(draft.fields, alone, draft.memory)
     return node

@@ -17,6 +17,7 @@ from formats.views import View
 from fusedrf_cli.bridge.cutouts import Cutout, ObjectCutout, RestCutout
 from fusedrf_cli.bridge.cutting import Fields, Whole, cut, cut_with_hidden, nodes_of
 from fusedrf_cli.bridge.distilled import DistilledShape, holders_in
+from fusedrf_cli.bridge.editing import Draft
 from fusedrf_cli.bridge.fusing import fuse
 from fusedrf_cli.bridge.inpainting import Frame, fill_hole
 from fusedrf_cli.bridge.memory import Memory
@@ -27,6 +28,7 @@ from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.bridge.selecting import (
     ObjectCues,
     SelectingConfig,
+    check_cues,
     cues_of,
     in_frame,
     nothing_selected,
@@ -73,10 +75,12 @@ def extract(request: ExtractRequest, progress) -> dict:
             check_preview(request)
         progress.phase("reading", None)
         memory = Memory(request.memory)
-        pieces = Whole.read(request.field, memory)
-        named_views = views_by_name(request, pieces)
+        draft = Draft(request.field, memory)
+        named = named_nodes(request, draft)
+        named_views = views_by_name(request, draft.graph)
+        check_cues(request, named_views)
+        pieces = Whole.read(draft)
         progress.phase("choosing", None)
-        named = named_nodes(request, pieces)
         object_field, shown, rest, figures = parted(request, pieces, named, named_views, progress)
         box = placed_box(shown.occupancy.look_at_box, pieces.origin)
         left = pieces.composed(rest) if request.invert or request.preview else None
@@ -117,20 +121,20 @@ def extract(request: ExtractRequest, progress) -> dict:
     }
 
 
-def named_nodes(request: ExtractRequest, whole: Whole) -> set[str]:
+def named_nodes(request: ExtractRequest, draft: Draft) -> set[str]:
     """The nodes that hold a field and go by the name that was asked for, or are in one that does; none where
     that is an object in a distilled field. InvalidInput where there is nothing of that name."""
     if request.name is None:
         return set()
     if request.masks or request.points or request.boxes or request.spheres or request.mesh:
         raise UsageProblem("--name takes a whole part; leave out what else tells of the object")
-    if request.name in whole.draft.inside:
+    if request.name in draft.inside:
         return set()
-    named = leaf_names(chosen(whole.scene, {request.name}))
+    named = leaf_names(chosen(draft.graph, {request.name}))
     if not named:
-        held = ", ".join(sorted(whole.draft.names))
+        held = ", ".join(sorted(draft.names))
         raise InvalidInput(f"{request.field}: there is no part '{request.name}'; it holds {held}")
-    if named.isdisjoint(whole.raw):
+    if named.isdisjoint(leaf.name for leaf in draft.graph.leaves() if leaf.visible):
         raise InvalidInput(f"{request.field}: '{request.name}' is hidden; show it, or choose another part")
     return named
 

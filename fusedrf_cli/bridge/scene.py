@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.bundle import BundleWriter, OpenBundle, is_bundle, shared_members
+from formats.bundle import BundleWriter, FieldSet, OpenBundle, is_bundle, shared_members
 from formats.errors import FormatError
 from formats.graph import placement_of
 from formats.nodes import Leaf, check_affine
@@ -23,7 +23,7 @@ from fusedrf_cli.bridge.memory import Memory, sources
 from fusedrf_cli.engine.composition.affine import WHITE, Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import FieldMemory, StoredField
-from fusedrf_cli.engine.fields.occupancy import placement
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placement
 from fusedrf_cli.engine.fields.streamed import StreamedField, opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
@@ -181,14 +181,14 @@ def note_options(request: FuseRequest, loaded: LoadedScene, progress) -> None:
         progress.warn(f"{option} does not apply to fields of kind {', '.join(others)}: they keep theirs")
 
 
-def needs_of(bundle: OpenBundle, member: str) -> FieldMemory:
+def needs_of(bundle: FieldSet, member: str) -> FieldMemory:
     """What a field of a bundle needs of memory, told by its header before it is read. InvalidInput where that
     makes no field."""
     header = bundle.headers[member]
+    arrays = bundle.arrays(member)
     shapes = {name: shape for name, (_, shape) in header.arrays.items()}
     try:
-        kind = registry.kind(header.kind)
-        needs = kind.field_memory(header.metadata, shapes, partial(bundle.array, member))
+        needs = registry.kind(header.kind).field_memory(header.metadata, shapes, arrays.__getitem__)
     except MALFORMED:  # reading the field says what is wrong
         needs = FieldMemory(header.decoded_size, 0)
     shared = shared_members(member, header, bundle.headers, str(bundle.path)).values()
@@ -196,6 +196,18 @@ def needs_of(bundle: OpenBundle, member: str) -> FieldMemory:
     decoding = max(map(reading_size, parts)) - needs.resident  # before anything is made of the arrays
     reading = sum(part.decoded_size for part in parts) + max(needs.reading, decoding)
     return replace(needs, reading=reading)
+
+
+def grid_of(leaf: Leaf, bundle: FieldSet, member: str) -> OccupancyGrid | None:
+    """The occupancy grid of what a leaf shows of a field, without its other numbers; None where only reading
+    the field tells, or says what is wrong with it."""
+    if leaf.crops:
+        return None
+    header = bundle.headers[member]
+    try:
+        return registry.kind(header.kind).stored_occupancy(header.metadata, bundle.arrays(member))
+    except MALFORMED:
+        return None
 
 
 def load_scene(
@@ -220,10 +232,19 @@ def load_scene(
 
 
 def load_bundle(
-    bundle: OpenBundle, graph: SceneGraph, budget: Memory | None = None, device: str = "cpu"
+    bundle: FieldSet, graph: SceneGraph, budget: Memory | None = None, device: str = "cpu"
 ) -> LoadedScene:
     """As `load_scene`, of a bundle that is open, by its graph or another one over its fields."""
     return _Loader(bundle.path, budget, device).load(graph, False, bundle)
+
+
+def outlines(
+    bundle: FieldSet, graph: SceneGraph, budget: Memory | None, known: dict[str, StreamedField]
+) -> list[Placed]:
+    """The same to know where its visible nodes lie: a field is read when its header and its grid do not tell
+    that, and held against the budget then. known: fields that were asked before, and come to be."""
+    loader = _Loader(bundle.path, budget, "cpu", known)
+    return [loader.outline(*found) for found in loader.found(graph, False, bundle)]
 
 
 def load_fields(
@@ -236,13 +257,23 @@ def load_fields(
 class _Loader:
     """Finds the fields of one scene; every bundle is opened once, and read from that version to the end."""
 
-    def __init__(self, path: Path, budget: Memory | None, device: str):
+    def __init__(
+        self,
+        path: Path,
+        budget: Memory | None,
+        device: str,
+        known: dict[str, StreamedField] | None = None,
+    ):
         self.path, self.budget, self.field_cache, self.device = path, budget, FieldCache(), device
         self.bundles: dict[Path, OpenBundle] = {}
-        self.fields: dict[str, StreamedField] = {}
+        self.fields: dict[str, StreamedField] = {} if known is None else known
         self.camera_sets: list[PlacedCameraSet] = []
 
     def load(self, graph: SceneGraph, allow_outside: bool, bundle: OpenBundle | None = None) -> LoadedScene:
+        return self.read(graph, self.found(graph, allow_outside, bundle), bundle)
+
+    def found(self, graph: SceneGraph, allow_outside: bool, bundle: OpenBundle | None) -> list[FoundField]:
+        """The fields that visible leaves of a graph place."""
         fields = []
         leaves = graph.leaves()
         for leaf in leaves:
@@ -257,7 +288,7 @@ class _Loader:
             raise InvalidInput(f'{self.path}: nothing of the scene is visible; remove a "visible": false')
         if not fields:
             raise InvalidInput(f"{self.path}: the scene places no field; add a node with a 'source'")
-        return self.read(graph, fields, bundle)
+        return fields
 
     def read(
         self, graph: SceneGraph, field_list: Sequence[FoundField], bundle: OpenBundle | None = None
@@ -314,22 +345,47 @@ class _Loader:
 
     def source(self, leaf: Leaf, bundle: OpenBundle, member: str, needs: FieldMemory) -> SourceField:
         """leaf: where the field lies, under which name, and what is shown of it."""
-        where, key = f"{bundle.path}: node '{leaf.name}'", key_of(leaf, member)
+        key = key_of(leaf, member)
 
         def read():
-            return cropped(make_field(bundle.field(member), where), leaf, where).to(self.device)
+            return self.field_cache.take(key, needs.held, partial(self.field, leaf, bundle, member))
 
         if key not in self.fields:
-            self.fields[key] = StreamedField(lambda: self.field_cache.take(key, needs.held, read))
+            self.fields[key] = StreamedField(read, partial(grid_of, leaf, bundle, member))
+            self.fields[key].kept  # noqa: B018  (read now, so that before any work what is no field is refused)
+        shown = leaf.whole, bool(leaf.crops), leaf.groups
+        return SourceField(self.placed(leaf, bundle, key), leaf.background, bundle, member, needs, *shown)
+
+    def outline(self, leaf: Leaf, bundle: FieldSet, member: str) -> Placed:
+        """The same of a field that is read, and not kept, where its header and its grid do not tell where it
+        lies."""
+        key = key_of(leaf, member)
+
+        def read():
+            needs = needs_of(bundle, member)
+            if self.budget is not None:
+                parts = {f"the field of '{leaf.name}'": needs.held + needs.reading}
+                self.budget.expect(parts, advice="allow more by --memory")
+            return self.field(leaf, bundle, member)
+
+        if key not in self.fields:
+            self.fields[key] = StreamedField(read, partial(grid_of, leaf, bundle, member))
+        return self.placed(leaf, bundle, key)
+
+    def field(self, leaf: Leaf, bundle: FieldSet, member: str) -> StoredField:
+        """What a leaf shows of a field."""
+        where = f"{bundle.path}: node '{leaf.name}'"
+        return cropped(make_field(bundle.field(member), where), leaf, where).to(self.device)
+
+    def placed(self, leaf: Leaf, bundle: FieldSet, key: str) -> Placed:
+        """A field where a leaf places it. Raises what says that it cannot."""
         try:
             check_affine(leaf.object_to_world, f"node '{leaf.name}' in the world")
-            placed = Placed(leaf.name, self.fields[key], leaf.object_to_world, leaf.opacity, leaf.tint)
+            return Placed(leaf.name, self.fields[key], leaf.object_to_world, leaf.opacity, leaf.tint)
         except FormatError as error:
             raise error.within(str(self.path)) from error
         except ValueError as error:
             raise InvalidInput(f"{bundle.path}: {error}; give an invertible placement") from error
-        shown = leaf.whole, bool(leaf.crops), leaf.groups
-        return SourceField(placed, leaf.background, bundle, member, needs, *shown)
 
 
 def key_of(leaf: Leaf, member: str) -> str:

@@ -12,6 +12,7 @@ from formats.closed_meshes import Hull
 from formats.errors import BadMask
 from formats.images import read_mask
 from formats.photos import pictures
+from formats.scene import SceneGraph
 from formats.views import View
 from fusedrf_cli.bridge.cutting import Whole
 from fusedrf_cli.bridge.distilled import inside
@@ -67,24 +68,31 @@ class ObjectCues:
 # -- what tells of it ----------------------------------------------------------------------------------------
 
 
-def views_by_name(request: ExtractRequest, fused: Whole) -> dict[str, View]:
+def views_by_name(request: ExtractRequest, scene: SceneGraph) -> dict[str, View]:
     """The views that masks and points are of, by name."""
     if request.cameras is not None:
         return {view.name: view for view in read_cameras(request.cameras)}
-    if fused.scene.cameras is None:
+    if scene.cameras is None:
         return {}
-    kept = read_camera_set(fused.scene.cameras)
+    kept = read_camera_set(scene.cameras)
     return {view.name: view for view in kept.test + kept.train}
 
 
-def cues_of(request: ExtractRequest, fused: Whole, named_views: dict[str, View], progress) -> ObjectCues:
-    """What a request says, read and checked."""
+def check_cues(request: ExtractRequest, named_views: dict[str, View]) -> None:
+    """Before any field is read: UsageProblem where nothing tells of the object, InvalidInput where masks or
+    points are of no view."""
+    if request.name is not None:
+        return
     if not (request.masks or request.points or request.boxes or request.spheres or request.mesh):
         raise UsageProblem("say which object: --masks, --points, --box, --sphere, --mesh or --name")
     if (request.masks or request.points) and not named_views:
         raise InvalidInput(
             f"{request.field}: it keeps no cameras that masks or points could be of; give --cameras"
         )
+
+
+def cues_of(request: ExtractRequest, fused: Whole, named_views: dict[str, View], progress) -> ObjectCues:
+    """What a request says, read and checked."""
     masks = masked_views(request, fused, named_views, progress) if request.masks else []
     pointed = [pointed_at(one, request, fused, named_views) for one in request.points]
     if pointed and not masks and not any(shows for *_, shows in request.points):

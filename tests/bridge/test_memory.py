@@ -229,7 +229,7 @@ from fusedrf_cli.engine import kernels
 budget = memory.Memory()
 loaded = scene.load_scene(sys.argv[1], budget=budget)
 loaded.placed[0].field.occupancy.arrays
-print(json.dumps([budget.base, budget.predicted - memory.COMPILED, memory.peak()]))
+print(json.dumps([budget.base, budget.predicted - memory.MemoryConfig.compiled, memory.peak()]))
 """
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from formats.bundle import OpenBundle, read_bundle
+from formats.bundle import FieldSet, OpenBundle, read_bundle
 from formats.scene import SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge.scene import load_scene, write_field
+from fusedrf_cli.bridge.scene import grid_of, load_scene, make_field, write_field
 from tests.bridge.conftest import done, invoke
 from tests.engine.conftest import BOX
 from tests.engine.kinds.cases import random_boxed, random_vm
@@ -87,6 +87,48 @@ def test_an_edit_changes_the_graph_alone_and_is_undone_to_the_bit(folder, report
     assert told["history"][-1]["objects"]
     report("undo", "four.rfpack", "-o", "four.rfpack", "-w")
     assert (folder / "four.rfpack").read_bytes() == before
+
+
+READ = {"crop": {"sparse"}, "replace": {"dense"}, "add": {"cp"}}
+"""Kinds of the fields that an edit reads: what it cuts, and what it brings. No other edit reads any."""
+
+
+@pytest.mark.parametrize("verb", EDITS)
+def test_an_edit_reads_no_field_that_it_can_do_without(folder, report, monkeypatch, verb):
+    read = record_of_reading(monkeypatch)
+    report(verb, "four.rfpack", *EDITS[verb], "-o", "out.rfpack")
+    assert set(read) == READ.get(verb, set()) and len(read) <= 1
+
+
+def test_words_are_checked_before_any_field_is_read(folder, run, monkeypatch):
+    read = record_of_reading(monkeypatch)
+    for words in (("rename", "four.rfpack", "none", "x"), ("extract", "four.rfpack", "--name", "none")):
+        result = run(*words, "-o", "out.rfpack")
+        assert result.exit_code == 3 and "there is no" in result.stderr and "cp, dense" in result.stderr
+    assert run("extract", "four.rfpack", "-o", "out.rfpack").exit_code == 2
+    assert read == []
+
+
+def record_of_reading(monkeypatch) -> list[str]:
+    """The kinds of the fields that are read from now on."""
+    read, field = [], FieldSet.field
+
+    def recorded(self, member: str):
+        read.append(self.headers[member].kind)
+        return field(self, member)
+
+    monkeypatch.setattr(FieldSet, "field", recorded)
+    return read
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+def test_where_a_field_lies_is_told_by_its_grid_alone(folder, kind):
+    bundle = OpenBundle(folder / f"{kind}.rfpack")
+    (leaf,) = bundle.scene.leaves()
+    grid = grid_of(leaf, bundle, leaf.field)
+    whole = make_field(bundle.field(leaf.field), kind).occupancy
+    assert grid.space is whole.space and np.array_equal(grid.look_at_box, whole.look_at_box)
+    assert np.array_equal(grid.occupied, whole.occupied) and np.array_equal(grid.aabb, whole.aabb)
 
 
 def test_edits_say_what_they_say(folder, report):

@@ -15,6 +15,7 @@ import torch
 
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import seen_placement, squeezed, transformed_aabb
+from fusedrf_cli.engine.fields.streamed import look_at_box
 from fusedrf_cli.engine.kernels.reference import exact
 from fusedrf_cli.engine.spaces import bounded
 
@@ -56,7 +57,7 @@ class Placed:
     def aabb(self) -> np.ndarray:
         """(6,) world box around the field's occupied cells, or, where it fills all of space, around the
         middle of its core."""
-        return transformed_aabb(self.field.occupancy.look_at_box, self.object_to_world)
+        return transformed_aabb(look_at_box(self.field), self.object_to_world)
 
     @cached_property
     def unbounded(self) -> bool:

@@ -278,6 +278,21 @@ class BoxField(ComputedField):
         return FieldMemory(4 * numbers + PER_CELL * math.prod(counts), making, unwritten)
 
     @classmethod
+    def stored_occupancy(cls, metadata: dict, arrays: Mapping[str, np.ndarray]) -> OccupancyGrid:
+        """See Kind."""
+        return cls.stored_cells(metadata["cells"], arrays)
+
+    @classmethod
+    def stored_cells(cls, cells: dict, arrays: Mapping[str, np.ndarray]) -> OccupancyGrid:
+        """The occupancy grid that metadata tell of and one of the arrays holds. Raises as `from_state`."""
+        counts = list(whole_numbers(cells["counts"], 1, "cells"))
+        return OccupancyGrid(
+            checked_box(cells["aabb"], "cells"),
+            unpack_bits(arrays, cls.stored_name("occupancy"), counts),
+            space_named(cells.get("space", "bounded")),
+        )
+
+    @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "BoxField":
         """Inverse of `state`. Every number is checked before it can size an array or index one. Raises
         ValueError, KeyError or TypeError for what does not fit."""
@@ -286,13 +301,7 @@ class BoxField(ComputedField):
         box, scale, shift = metadata["aabb"], float(metadata["scale"]), float(metadata["shift"])
         if not (0 < scale < np.inf and np.isfinite(shift)):
             raise ValueError(f"scale should be positive and shift finite, found {scale} and {shift}")
-        counts = list(whole_numbers(metadata["cells"]["counts"], 1, "cells"))
-        cells = metadata["cells"]
-        grid = OccupancyGrid(
-            checked_box(cells["aabb"], "cells"),
-            unpack_bits(arrays, cls.stored_name("occupancy"), counts),
-            space_named(cells.get("space", "bounded")),
-        )
+        grid = cls.stored_cells(metadata["cells"], arrays)
         bare = cls(shape, checked_box(box, "aabb"), resolution, scale, shift, torch.zeros(0), grid)
         check_samples(grid.space.most_samples(grid.aabb, sampling_step(bare)), "the field")
         for part in bare.parts:  # before `params` takes memory

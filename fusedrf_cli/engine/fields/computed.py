@@ -200,6 +200,11 @@ class ComputedField:
         """See `Kind.field_memory`."""
         return FieldMemory(4 * sum(math.prod(shape) for shape in shapes.values()), 0)
 
+    @classmethod
+    def stored_occupancy(cls, metadata: dict, arrays: Mapping[str, np.ndarray]) -> OccupancyGrid | None:
+        """See Kind."""
+        return None
+
     @property
     def device_loops(self) -> ModuleType:
         """The module of loops of the device that the numbers lie on."""

@@ -15,7 +15,7 @@ from fusedrf_cli.engine.composition.resolution_report import ResolutionReport, r
 from fusedrf_cli.engine.fields.base import FieldMemory, RadianceField, StoredField
 from fusedrf_cli.engine.fields.box import BoxField
 from fusedrf_cli.engine.fields.computed import ComputedField, Reads
-from fusedrf_cli.engine.fields.occupancy import texels
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, texels
 from fusedrf_cli.engine.kinds import field_cutting
 from fusedrf_cli.engine.kinds.builder import (
     BuildRequest,
@@ -163,6 +163,11 @@ class Kind:
         """What a stored field of these metadata and shapes of arrays needs of memory; array(name) reads one
         of them. Raises what `from_state` does where they make no field."""
         return self.field.needs(metadata, shapes, array)
+
+    def stored_occupancy(self, metadata: dict, arrays: Mapping[str, np.ndarray]) -> OccupancyGrid | None:
+        """The occupancy grid of a stored field, of few of its arrays, which are decoded when they are asked
+        for; None where only the field has it. Raises what `from_state` does where they make no field."""
+        return self.field.stored_occupancy(metadata, arrays)
 
     def sweeps(self, least_psnr: float) -> dict[str, list[Sweep]]:
         """The ways to fuse that are worth charting, in groups that take about as long; those that learn least

@@ -138,6 +138,18 @@ def test_hanging_rows_are_averages_of_free_ones(n):
     np.testing.assert_allclose(spread @ vertices[: lattice.free], vertices[lattice.free :], atol=1e-9)
 
 
+@pytest.mark.parametrize("longest", [1, 8, 16, 64])
+def test_the_occupancy_is_the_cells_of_active_voxels(longest):
+    """Voxel by voxel, of every level, in top cells, their halves and their quarters."""
+    tree = random_tree(2)
+    grid = tree.occupancy(longest)
+    expected = np.zeros_like(grid.occupied)
+    for level, at, mask in zip(tree.level, tree.at, tree.mask, strict=True):
+        middles = (at * SIDE + np.argwhere(mask) + 0.5) * tree.top / (SIDE << level)
+        expected[tuple(np.floor(middles / grid.cell).astype(int).T)] = True
+    np.testing.assert_array_equal(grid.occupied, expected)
+
+
 def test_the_occupancy_covers_every_active_voxel(rng):
     tree = random_tree(2)
     grid = tree.occupancy(64)

@@ -221,10 +221,12 @@ class BrickTree:
         occupied = np.zeros(tuple(n << fine for n in self.counts), bool)
         for level in range(self.depth + 1):
             at_level = self.level == level
-            brick, *inner = np.nonzero(self.mask[at_level])
-            # a cell is at least a voxel of level 0 wide, so a voxel lies in one of them
-            voxel = self.at[at_level][brick] * SIDE + np.stack(inner, 1)
-            occupied[tuple((voxel >> (level + 2 - fine)).T)] = True
+            # a cell is at least a voxel of level 0 wide: of a wider brick it is one of n³ equal parts
+            finer, coarser = max(fine - level, 0), max(level - fine, 0)
+            n, m = 1 << finer, SIDE >> finer
+            brick, *inner = np.nonzero(self.mask[at_level].reshape(-1, n, m, n, m, n, m).any((2, 4, 6)))
+            part = self.at[at_level][brick] * n + np.stack(inner, 1)
+            occupied[tuple((part >> coarser).T)] = True
         return OccupancyGrid(self.aabb, occupied)
 
 

@@ -208,7 +208,7 @@ class SparseField(Assembled):
     @cached_property
     def occupancy(self) -> OccupancyGrid:
         """Cells that active voxels reach."""
-        return replace(self.tree.occupancy(current(BricksConfig).occupancy_cells), space=self.lies_in)
+        return cells_of(self.tree, self.lies_in)
 
     @cached_property
     def slots(self) -> dict[str, Slot]:
@@ -340,6 +340,11 @@ class SparseField(Assembled):
         )
 
     @classmethod
+    def stored_occupancy(cls, metadata: dict, arrays: Mapping[str, np.ndarray]) -> OccupancyGrid:
+        """See Kind."""
+        return cells_of(stored_tree(arrays, metadata), space_named(metadata.get("space", "bounded")))
+
+    @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "SparseField":
         """Inverse of `state`. Every number is checked before it can size an array or index one."""
         tree = stored_tree(arrays, metadata)
@@ -364,7 +369,12 @@ class SparseField(Assembled):
         return field
 
 
-def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
+def cells_of(tree: BrickTree, space: ModuleType) -> OccupancyGrid:
+    """The cells of a space that the active voxels of a tree reach."""
+    return replace(tree.occupancy(current(BricksConfig).occupancy_cells), space=space)
+
+
+def stored_tree(arrays: Mapping[str, np.ndarray], metadata: dict) -> BrickTree:
     """The tree of a stored field. Raises ValueError naming what does not fit."""
     limits = current(BrickLimits)
     config = current(SamplingConfig)
@@ -381,13 +391,13 @@ def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
         raise ValueError("aabb should be six finite numbers")
     if not np.allclose(aabb[3:] - aabb[:3], top * counts, rtol=1e-6):
         raise ValueError("aabb should be as many top cells wide as counts says")
-    for name in ("nodes", "masks"):
-        stored = arrays.get(name)
+    nodes, masks = (arrays.get(name) for name in ("nodes", "masks"))
+    for name, stored in (("nodes", nodes), ("masks", masks)):
         if stored is None or stored.dtype != np.uint8 or stored.ndim != 1:
             raise ValueError(f"array '{name}' should be bytes in one dimension")
-    if len(arrays["masks"]) > 8 * limits.bricks:
-        raise ValueError(f"there should be at most {limits.bricks} bricks, found {len(arrays['masks']) // 8}")
-    tree = BrickTree.unpacked(aabb[:3], top, counts, arrays["nodes"], arrays["masks"])
+    if len(masks) > 8 * limits.bricks:
+        raise ValueError(f"there should be at most {limits.bricks} bricks, found {len(masks) // 8}")
+    tree = BrickTree.unpacked(aabb[:3], top, counts, nodes, masks)
     phase = metadata.get("phase", [0, 0, 0])
     if not isinstance(phase, list) or len(phase) != 3:
         raise ValueError(f"phase should be three numbers, found {phase}")

@@ -162,6 +162,11 @@ class VMField(AssembledField):
         return FieldMemory(4 * numbers + PER_CELL * cells, PER_CELL_MADE * cells)
 
     @classmethod
+    def stored_occupancy(cls, metadata: dict, arrays: Mapping[str, np.ndarray]) -> OccupancyGrid:
+        """See Kind."""
+        return cls.stored_cells(box_metadata(cls.kind, metadata)["cells"], arrays)
+
+    @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMField":
         """See BoxField."""
         config = current(VMConfig)
