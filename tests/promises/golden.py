@@ -35,7 +35,7 @@ KEPT = GOLDEN / "kept"
 POINTS = 96
 SIDE = 16  # pixels of the pictures
 SAMPLES = 400  # of their rays
-SHORT = 0.005  # step in all of space, in units of the field's frame
+SHORT = 0.002  # step, in units of the field's frame
 FAR = np.array([-7e11, 5411200.0, 1e12])
 
 
@@ -90,9 +90,9 @@ def picture(path: Path, case: Case) -> np.ndarray:
 
 
 def drawn(path: Path, case: Case) -> np.ndarray:
-    """(SIDE, SIDE, 4) float64: the same as the program draws it; of all of space by short steps, since by its
-    own the farthest sample of a toy's fog stands for all that is behind it."""
-    shown = open_scene(path).render(view(case), step=SHORT if case.spread else None)
+    """(SIDE, SIDE, 4) float64: the same as the program draws it, by short steps: by its own a toy of few
+    texels has few samples."""
+    shown = open_scene(path).render(view(case), step=SHORT)
     return torch.cat([shown.rgb, shown.opacity[..., None]], 2).double().numpy()
 
 
