@@ -16,7 +16,7 @@ import pytest
 from fusedrf_cli.bridge.evaluation_views import EvaluationViewConfig
 from fusedrf_cli.engine.distillation.finetune import FinetuneConfig
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
-from fusedrf_cli.engine.kinds.instances import InstancesConfig
+from fusedrf_cli.engine.kinds.allocation import AllocationConfig
 from fusedrf_cli.engine.kinds.vm.builder import VMBuilderConfig
 from tests.analytic.export import SHAPE, NotExportable
 from tests.bridge.conftest import TinySettings
@@ -82,7 +82,7 @@ def quick(in_force) -> None:
         VMBuilderConfig(SHAPE),
         TinySettings(),
         FinetuneConfig(rays=15_000, steps=30, rays_per_step=500),
-        InstancesConfig(ranks=(None,)),  # others would be compiled
+        AllocationConfig(ranks=()),  # others would be compiled
         EvaluationViewConfig(whole=2, most_objects=0),
     )
 
