@@ -100,8 +100,8 @@ def write_report(folder: Path, trained: dict[str, dict], built: dict[str, dict],
         "",
     ]
     for name, text in {
-        "scene.png": "composed, every field asked at every sample",
-        "fused.png": "fused into one field",
+        "scene.png": "composed",
+        "fused.png": "fused into one bundle",
         "more.png": "a ball added",
         "less.png": "the large tower deleted",
         "turn.gif": "a turn around it",

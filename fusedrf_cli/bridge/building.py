@@ -336,9 +336,8 @@ class Maker:
             self.glances[id(source)] = glance
         glance = self.glances[id(source)]
         back = (made if precision is None else stored(made, precision)).to(self.device)
-        shown = render_rays(back, glance.rays_o, glance.rays_d)[:, :4]
-        over_white = (shown - glance.shown) @ np.eye(4, 3) - (shown - glance.shown)[:, 3:]
-        return float(np.square(over_white).mean())
+        off = render_rays(back, glance.rays_o, glance.rays_d)[:, :4] - glance.shown
+        return float(np.square(off[:, :3] - off[:, 3:]).mean())
 
     # -- students that learn from nothing --------------------------------------------------------------------
 

@@ -175,7 +175,7 @@ def as_it_is(builder: DistilledBuilder, scene: FuseScene) -> Candidate:
     """A scene whose fields are all as their sources have them: it shows what the scene does."""
     whole, storage = builder.unchanged(), builder.plain()
     trial = Trial(storage, builder.request.limit, whole.bytes, PSNR_CAP, PSNR_CAP, True, True)
-    kept = BestTrial(trial, whole.field)
+    kept = BestTrial(trial, whole.field, own_storage=whole.storage)
 
     def figures() -> dict:
         return {"psnr": reached_by(kept, builder), "seconds": {}} | chosen_of(kept, builder, scene, 1, {})

@@ -5,6 +5,7 @@ for the error that it adds (greedy allocation of bits; Shoham and Gersho 1988)."
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import islice
 from math import exp, log
 
 from fusedrf_cli.engine.kinds.builder import StorageSetting
@@ -99,16 +100,15 @@ class FieldShares:
         return exp((1 - share) * log(measured(before)) + share * log(measured(after)))
 
     def moves(self, share: Share) -> Iterator[Share]:
-        """Shares of fewer bytes: each next precision, spacing and number of components."""
+        """Shares of fewer bytes: in this and each cheaper precision the next spacing that saves any, and the
+        next number of components."""
         config, size = current(AllocationConfig), self.bytes(share)
-        at = self.ladder.index(share.precision)
-        tried = [replace(share, precision=p) for p in self.ladder[at + 1 :]]
-        if self.ranked:
-            left = [r for r in config.ranks if share.ranks is None or r < share.ranks]
-            tried += [replace(share, ranks=r) for r in left[:1]]
-        wider = (replace(share, steps=n) for n in range(share.steps + 1, config.most_steps + 1))
-        tried += [one for one in [next((w for w in wider if self.bytes(w) < size), None)] if one]
-        yield from (one for one in tried if self.bytes(one) < size)
+        fewer = [r for r in config.ranks if share.ranks is None or r < share.ranks] if self.ranked else []
+        for precision in self.ladder[self.ladder.index(share.precision) :]:
+            spacings = (Share(precision, n, share.ranks) for n in range(share.steps, config.most_steps + 1))
+            components = (Share(precision, share.steps, r) for r in fewer[:1])
+            for tried in (spacings, components):
+                yield from islice((one for one in tried if self.bytes(one) < size), 1)
 
     def smallest(self) -> int:
         """Bytes of the least share."""

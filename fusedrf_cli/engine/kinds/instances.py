@@ -90,6 +90,7 @@ class InstancesBuilder(DirectBuilder):
 
     distil_config = None
     gain = 5.0  # dB, the most that was seen
+    compares = False  # bytes are shared out among the fields: that is the one way
 
     def __init__(self, kind: InstancesKind, scene: ComposedField, request: BuildRequest):
         super().__init__(kind, scene, request)
@@ -109,7 +110,7 @@ class InstancesBuilder(DirectBuilder):
         return StorageSetting(request.precision or EACH, request.ranks, request.sh_degree)
 
     def storage_settings(self) -> list[list[StorageSetting]]:
-        """Bytes are shared out among the fields, so that there is nothing to compare."""
+        """One."""
         return [[self.plain()]]
 
     def unchanged(self) -> Candidate | None:
@@ -117,7 +118,10 @@ class InstancesBuilder(DirectBuilder):
         request, size = self.request, self.bytes_as_they_are
         if request.precision or request.ranks or request.sh_degree is not None or request.target is not None:
             return None
-        return Candidate(self.scene, size, True, True) if size is not None and size <= request.limit else None
+        if size is None or size > request.limit:
+            return None
+        storage = replace(self.plain(), each=("",) * len(self.fields))
+        return Candidate(self.scene, size, True, True, storage)
 
     def build(self, storage: StorageSetting, limit: int) -> Candidate | None:
         """The fields, each with its share of the bytes."""
@@ -167,10 +171,9 @@ class InstancesBuilder(DirectBuilder):
         """Of the i-th field."""
         kind, outline, field = self.kinds[i], self.outlines[i], self.fields[i]
         own = self.request.stored_bytes.get(id(field))
-        as_asked = kind.reduction(outline, 0.0, storage)
         ladder = [storage.precision] if storage.precision != EACH else list(reversed(self.kind.precisions))
-        if own is not None and storage.precision == EACH and as_asked.lossless:
-            ladder = [None, *(p for p in ladder if self.bytes_at(i, as_asked, p) < own)]
+        if own is not None and storage.precision == EACH and kind.reduction(outline, 0.0, storage).lossless:
+            ladder = [None, *ladder]
 
         def bytes_at(reduction: Reduction, precision: str | None) -> int:
             if precision is not None:

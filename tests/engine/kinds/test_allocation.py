@@ -71,6 +71,14 @@ def test_what_shows_least_goes_first():
     assert [one.precision for one in allocated(fields, 130_000)] == ["int4", None]
 
 
+def test_what_has_few_bits_already_gets_wider_texels():
+    """A source in 4 bits, whose numbers take no fewer bytes anew."""
+    one = field(100_000)
+    one.bytes = lambda share, before=one.bytes: 25_000 if share == one.whole else before(share)
+    (share,) = allocated([one], 20_000)
+    assert share.precision is not None and share.steps > 0 and 10_000 < one.bytes(share) <= 20_000
+
+
 def test_bytes_left_over_make_texels_finer():
     """Bits come in halves; of texels there is always a spacing that nearly fits."""
     fields = [field(100_000), field(50_000, dimensions=3)]
