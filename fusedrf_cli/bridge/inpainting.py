@@ -42,8 +42,8 @@ from fusedrf_cli.requests import HoleRequest, Learning, TrainRequest
 class InpaintingConfig:
     """How a hole is learnt and filled."""
 
-    seconds: float = 120.0
-    """Of learning from --refit's photos, where no time budget is given."""
+    seconds: float | None = 120.0
+    """Of learning from --refit's photos, where no time budget is given; None: by steps, as `train` does."""
     share: float = 0.8
     """Of a time budget that goes to it."""
     faint: float = 0.03

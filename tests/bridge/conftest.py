@@ -106,7 +106,7 @@ TINY = (
     EvaluationViewConfig(whole=2, most_objects=0),
     BuildingConfig(views=2),
     VMBuilderConfig(SHAPE),
-    InpaintingConfig(settings=TinySettings(), numbers=VMField.size_of(SHAPE, (20, 20, 20))),
+    InpaintingConfig(None, settings=TinySettings(), numbers=VMField.size_of(SHAPE, (20, 20, 20))),
     TrainPresets(DRAFT, DRAFT, DRAFT, DRAFT),
     TinySettings(),
     FinetuneConfig(rays=15_000, steps=30, rays_per_step=500),

@@ -153,7 +153,7 @@ def test_photos_of_the_place_show_what_an_object_hid(report, picture, folder):
     gone, wanted, before = covered("blue", -0.1), picture("pair.json"), picture("vm.rfpack")
     write_views(folder / "place", FIELDS["floor"], PLACES["floor"], 48, 16)
     (folder / "floor.rfpack").write_bytes(b"another file")
-    words = ("--refit", "place", "--time-budget", "4", "--no-finetune")
+    words = ("--refit", "place", "--no-finetune")
     said = report("delete", "vm.rfpack", "blue", *words, "-o", "less.rfpack")
     assert said["restored"] is True and said["photos"] == 32
     after, away = picture("less.rfpack"), ~covered("blue", 0.3)

@@ -244,7 +244,7 @@ def test_what_was_under_it_is_learnt_from_photos(report, folder, picture):
     """Of photos that show the red box too, whose pixels are left out; of the floor they show enough."""
     report("compose", "floor.rfpack", "--translate", "0,0,-0.7", "-o", "floor.json")
     write_views(folder / "floor", FIELDS["floor"], PLACES["floor"], 48, 16)
-    words = ("--invert", "--refit", "floor", "--time-budget", "8")
+    words = ("--invert", "--refit", "floor")
     said = report("extract", "blocks.rfpack", *COLUMN, *words, "-o", "learnt.rfpack")
     assert said["hole"]["photos"] == 32
     report("extract", "blocks.rfpack", *COLUMN, "--invert", "-o", "rest.rfpack")
