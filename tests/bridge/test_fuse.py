@@ -192,7 +192,7 @@ def test_a_fuse_goes_on_to_the_same_bytes(report, run, folder, interrupted_in_st
 
 def test_a_kind_that_is_made_goes_on_to_the_same_bytes(report, run, folder, interrupted_in_step):
     """It learns from pictures alone; another kind does not go on from its numbers."""
-    words = ("fuse", "pair.json", "--kind", "sparse", "-o")
+    words = ("fuse", "pair.json", "--kind", "sparse", "--max-size", "100kB", "-o")
     report(*words, "straight.rfpack")
     with interrupted_in_step(5):
         result = run(*words, "fused.rfpack")
