@@ -10,10 +10,11 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
+from formats.field_header import FieldHeader, decode_header
 from formats.graph import belongs, free_name, placement_of
 from formats.history import distilled, listed
 from formats.nodes import WHITE
-from formats.records import FieldHeader, decode_header, encode_stored, mapped_array, member_name
+from formats.records import encode_stored, mapped_array, member_name
 from formats.scene import Box, Matrix4, Node, SceneGraph
 
 KIND = "vm"

@@ -22,17 +22,10 @@ from formats.errors import (
     MissingMember,
     UnknownMember,
 )
+from formats.field_header import FieldHeader, decode_header
 from formats.nodes import WHITE
 from formats.object_summary import objects_in, world_aabb
-from formats.records import (
-    FieldHeader,
-    FieldRecord,
-    StoredArrays,
-    decode_field,
-    decode_header,
-    encode_field,
-    member_name,
-)
+from formats.records import FieldRecord, StoredArrays, decode_field, encode_field, member_name
 from formats.safe_input import open_input
 from formats.scene import FORMAT, MEMBER, SceneGraph, dump_scene, parse_scene, read_scene
 

@@ -7,9 +7,9 @@ import msgspec
 import numpy as np
 
 from formats.blocks import UNNAMED
+from formats.field_header import FieldHeader
 from formats.graph import belongs
 from formats.history import DistilledNode, distilled
-from formats.records import FieldHeader
 from formats.scene import SceneGraph
 
 

@@ -10,8 +10,9 @@ import torch
 from fusedrf_cli.bridge.background import Background
 from fusedrf_cli.bridge.budget import Budget
 from fusedrf_cli.bridge.evaluation_views import evaluation_views_of, unbounded_views
+from fusedrf_cli.bridge.field_bundle import stored
 from fusedrf_cli.bridge.runtime import Saved, checkpoint_mismatch, resumable, take_up
-from fusedrf_cli.bridge.scene import LoadedScene, background_of, stored
+from fusedrf_cli.bridge.scene import LoadedScene, background_of
 from fusedrf_cli.bridge.storage_search import SearchConfig, Trial
 from fusedrf_cli.bridge.training import warn_of_nonfinite
 from fusedrf_cli.engine.composition.affine import Placed

@@ -2,7 +2,7 @@
 history that tells what they were made of."""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,8 @@ from formats.scene import Leaf, Node, SceneGraph
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.background import LEARNT, Background
 from fusedrf_cli.bridge.building import BestTrial, FuseScene
-from fusedrf_cli.bridge.scene import NO_MEMBER, LoadedScene, SourceField, history_nodes, showing_of
+from fusedrf_cli.bridge.field_bundle import NO_MEMBER
+from fusedrf_cli.bridge.scene import LoadedScene, SourceField, showing_of
 from fusedrf_cli.bridge.sizes import graph_bytes
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import StoredField
@@ -213,3 +214,23 @@ def unchanged_bytes(loaded: LoadedScene) -> int | None:
     """Bytes of the members of all fields; None: they are not known."""
     sizes = {f.member: f.bundle.headers[f.member].size for f in loaded.fields if f.member in f.bundle.headers}
     return sum(sizes.values()) if all(f.member in sizes for f in loaded.fields) else None
+
+
+def history_nodes(scene: LoadedScene, output: str, kept_members: Container[str]) -> list[dict]:
+    """What a history entry says of every source: name, placement, box, path from the output's folder,
+    checksum, kept member.
+    """
+    folder, nodes = Path(output).resolve().parent, []
+    for f in scene.fields:
+        node = {
+            "name": f.placed.name,
+            "object_to_world": f.placed.object_to_world.tolist(),
+            "aabb": f.placed.aabb.tolist(),
+            "field": f.member,
+            "background": f.background,
+            "kept": f.member in kept_members and f.whole,
+        }
+        if f.whole:  # an edit reads it again as it is
+            node |= {"source": os.path.relpath(f.bundle.path.resolve(), folder), "sha256": f.bundle.sha256}
+        nodes.append(node)
+    return nodes

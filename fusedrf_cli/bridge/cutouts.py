@@ -16,7 +16,8 @@ from formats.records import BITS, FieldRecord
 from formats.scene import Leaf, Node, SceneGraph, dump_scene
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.cutting import Fields, Whole
-from fusedrf_cli.bridge.scene import part_shown, stored
+from fusedrf_cli.bridge.field_bundle import stored
+from fusedrf_cli.bridge.scene import part_shown
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import placement

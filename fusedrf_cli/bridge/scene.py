@@ -1,23 +1,21 @@
 """Files to placed engine fields, and back."""
 
-import os
 import sys
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from formats.bundle import BundleWriter, FieldSet, OpenBundle, is_bundle, shared_members
+from formats.bundle import FieldSet, OpenBundle, is_bundle, shared_members
 from formats.errors import FormatError
-from formats.graph import placement_of
+from formats.field_header import reading_size
 from formats.nodes import Leaf, check_affine
 from formats.object_summary import world_aabb
-from formats.records import FieldRecord, as_stored, reading_size
-from formats.scene import MAX_SCENE_BYTES, SceneGraph, dump_scene, make_node, parse_scene
+from formats.records import FieldRecord
+from formats.scene import MAX_SCENE_BYTES, SceneGraph, parse_scene
 from formats.sources import expand_scene, inline_scenes, resolve_source
-from fusedrf_cli import __version__
 from fusedrf_cli.bridge.field_cache import FieldCache
 from fusedrf_cli.bridge.memory import Memory, sources
 from fusedrf_cli.engine.composition.affine import WHITE, Placed
@@ -30,7 +28,6 @@ from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.errors import FusedRFError, InvalidInput, UsageProblem
 from fusedrf_cli.requests import FuseRequest, TrainRequest
 
-NO_MEMBER = "fields/0000000000000000.safetensors"
 MALFORMED = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError)
 """What reading arrays and metadata that make no field may raise."""
 OPTIONS = {"ranks": "--ranks", "sh_degree": "--sh-degree"}
@@ -435,70 +432,10 @@ def _volume(source: SourceField) -> tuple[bool, float]:
     return placed.unbounded, float(np.prod(placed.aabb[3:] - placed.aabb[:3]))
 
 
-def history_nodes(scene: LoadedScene, output: str, kept_members: Container[str]) -> list[dict]:
-    """What a history entry says of every source: name, placement, box, path from the output's folder,
-    checksum, kept member.
-    """
-    folder, nodes = Path(output).resolve().parent, []
-    for f in scene.fields:
-        node = {
-            "name": f.placed.name,
-            "object_to_world": f.placed.object_to_world.tolist(),
-            "aabb": f.placed.aabb.tolist(),
-            "field": f.member,
-            "background": f.background,
-            "kept": f.member in kept_members and f.whole,
-        }
-        if f.whole:  # an edit reads it again as it is
-            node |= {"source": os.path.relpath(f.bundle.path.resolve(), folder), "sha256": f.bundle.sha256}
-        nodes.append(node)
-    return nodes
-
-
-def stored(field: StoredField, precision: str) -> StoredField:
-    """The field as it will come back from a bundle of that precision."""
-    return field.stored(lambda array, name, runs: as_stored(array, precision, name, runs))
-
-
-def write_field(
-    output: str,
-    field,
-    name: str,
-    *,
-    precision: str,
-    overwrite: bool,
-    origin: np.ndarray | None = None,
-    about: SceneGraph = SceneGraph(()),
-) -> int:
-    """Write one field as a bundle; its node is placed at `origin`: a position (3,), or a placement (4, 4). Of
-    a field that holds several objects each becomes a node. Returns the bytes written. History, framing and
-    cameras are those of `about`."""
-    writer = BundleWriter()
-    member = writer.add_field(FieldRecord(field.kind, *field.state()), precision)
-    graph = writer.unfolded(graph_of(member, name, origin, about))
-    writer.write(output, graph, overwrite=overwrite)
-    return Path(output).stat().st_size
-
-
 def showing_of(placed: Placed | Leaf) -> dict:
     """What a node says of how a placed field is shown, but for crops."""
     words = {} if placed.opacity == 1 else {"opacity": placed.opacity}
     return words | ({} if tuple(placed.tint) == WHITE else {"tint": list(placed.tint)})
-
-
-def graph_of(member: str, name: str, origin: np.ndarray | None, about: SceneGraph) -> SceneGraph:
-    """The scene of a bundle of one field; see `write_field`."""
-    node = make_node(name, field=member, **({} if origin is None else placement_of(placement(origin))))
-    return replace(about, nodes=(node,), generator=f"fusedrf {__version__}")
-
-
-def check_graph(output: str, name: str, origin: np.ndarray | None, about: SceneGraph) -> None:
-    """Before a field is learnt: raise what `write_field` would because of where it lies and what is kept
-    with it."""
-    try:
-        dump_scene(graph_of(NO_MEMBER, name, origin, about))
-    except FormatError as error:
-        raise error.within(output) from error
 
 
 def short_origin(object_to_world: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from formats.scene import SceneGraph
 from formats.views import Capture, check_parallax, hold_out
 from fusedrf_cli.bridge.capture_cameras import cameras_of_capture
 from fusedrf_cli.bridge.depth_supervision import known_points
+from fusedrf_cli.bridge.field_bundle import check_graph, stored, write_field
 from fusedrf_cli.bridge.holdout_evaluation import measure, warn_of_holdout
 from fusedrf_cli.bridge.memory import Memory, decoding, fitting, photos
 from fusedrf_cli.bridge.pictures import camera_of
@@ -30,7 +31,7 @@ from fusedrf_cli.bridge.runtime import (
     without_interrupts,
     written_somewhere,
 )
-from fusedrf_cli.bridge.scene import check_graph, refuse_options, stored, unusable_kind, write_field
+from fusedrf_cli.bridge.scene import refuse_options, unusable_kind
 from fusedrf_cli.bridge.scene_bounds import SceneBounds, check_flatness, scene_bounds_of
 from fusedrf_cli.bridge.sizes import BundleSizes, HeaderConfig, camera_bytes, section_bytes
 from fusedrf_cli.engine.distillation.config import TrainConfig

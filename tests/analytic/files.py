@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.scene import SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge.scene import write_field
+from fusedrf_cli.bridge.field_bundle import write_field
 from fusedrf_cli.engine.rendering.cameras import Camera
 from tests.analytic.scenes import Scene
 

@@ -19,8 +19,8 @@ from formats.scene import SceneGraph, make_node, write_scene
 from formats.views import View
 from fusedrf_cli.bridge.building import BuildingConfig
 from fusedrf_cli.bridge.evaluation_views import EvaluationViewConfig
+from fusedrf_cli.bridge.field_bundle import write_field
 from fusedrf_cli.bridge.inpainting import InpaintingConfig
-from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.bridge.training import TrainPresets
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.finetune import FinetuneConfig

@@ -2,7 +2,8 @@
 
 import pytest
 
-from fusedrf_cli.bridge.scene import load_scene, write_field
+from fusedrf_cli.bridge.field_bundle import write_field
+from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.fields.computed import ComputedField
 from fusedrf_cli.engine.fields.streamed import opened
 from tests.analytic.export import sparse_field

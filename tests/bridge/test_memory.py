@@ -20,10 +20,11 @@ from formats.bundle import OpenBundle
 from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge import memory, training
+from fusedrf_cli.bridge.field_bundle import write_field
 from fusedrf_cli.bridge.field_cache import FieldCache
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.runtime import load_checkpoint, save_checkpoint
-from fusedrf_cli.bridge.scene import load_scene, needs_of, write_field
+from fusedrf_cli.bridge.scene import load_scene, needs_of
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry

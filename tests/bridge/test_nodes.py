@@ -9,7 +9,8 @@ import torch
 
 from formats.bundle import FieldSet, OpenBundle, read_bundle
 from formats.scene import SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge.scene import grid_of, load_scene, make_field, write_field
+from fusedrf_cli.bridge.field_bundle import write_field
+from fusedrf_cli.bridge.scene import grid_of, load_scene, make_field
 from tests.bridge.conftest import done, invoke
 from tests.engine.conftest import BOX
 from tests.engine.kinds.cases import random_boxed, random_vm

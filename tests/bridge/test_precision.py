@@ -9,7 +9,8 @@ import pytest
 from formats.archive import read_archive
 from formats.bundle import read_bundle, read_headers
 from formats.records import PRECISIONS
-from fusedrf_cli.bridge.scene import load_scene, stored, write_field
+from fusedrf_cli.bridge.field_bundle import stored, write_field
+from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.vm import KIND

@@ -13,8 +13,9 @@ from formats.bundle import read_bundle
 from formats.images import read_image, write_png
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.background import Background, background_for, turn_of
+from fusedrf_cli.bridge.field_bundle import write_field
 from fusedrf_cli.bridge.fusing import source_bytes, unbounded_bytes
-from fusedrf_cli.bridge.scene import load_scene, write_field
+from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField

@@ -17,9 +17,10 @@ from formats.meshes import mesh_capture
 from formats.scene import SceneGraph, dump_scene, make_node, parse_scene, read_scene, write_scene
 from formats.views import View
 from fusedrf_cli.bridge.capture_cameras import cameras_of_capture
+from fusedrf_cli.bridge.field_bundle import write_field
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import renderable
-from fusedrf_cli.bridge.scene import load_scene, write_field
+from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.bridge.scene_bounds import SceneBounds
 from fusedrf_cli.bridge.training import TrainPresets
 from fusedrf_cli.bridge.views import choose_views, pinhole, sized, standing

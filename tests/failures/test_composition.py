@@ -13,7 +13,8 @@ from formats.bundle import read_bundle
 from formats.errors import FormatError
 from formats.records import FieldRecord, decode_field, encode_field
 from formats.scene import NODE_KEYS, SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge.scene import load_scene, make_field, write_field
+from fusedrf_cli.bridge.field_bundle import write_field
+from fusedrf_cli.bridge.scene import load_scene, make_field
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import as_composite

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from formats.images import read_image
-from fusedrf_cli.bridge.scene import write_field
+from fusedrf_cli.bridge.field_bundle import write_field
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import fit
 from fusedrf_cli.engine.distillation.occupancy_update import occupancy_of

@@ -13,7 +13,8 @@ import torch
 from formats.bundle import read_bundle, read_headers
 from formats.images import read_image
 from formats.scene import SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge.scene import load_scene, make_field, write_field
+from fusedrf_cli.bridge.field_bundle import write_field
+from fusedrf_cli.bridge.scene import load_scene, make_field
 from fusedrf_cli.engine.distillation.distill import distill
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.kinds.builder import StorageSetting

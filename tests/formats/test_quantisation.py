@@ -12,16 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from formats import errors, quantisation
+from formats.field_header import decode_header
 from formats.quantisation import BLOCKS, LEVELS, dequantised, scales_shape
-from formats.records import (
-    BYTES_PER_NUMBER,
-    FieldRecord,
-    as_stored,
-    coded_bytes,
-    decode_field,
-    decode_header,
-    encode_field,
-)
+from formats.records import BYTES_PER_NUMBER, FieldRecord, as_stored, coded_bytes, decode_field, encode_field
 
 SPEC = Path(__file__).parents[2] / "formats" / "SPEC.md"
 SMALLEST = 2.0**-24  # of the float16 above 0

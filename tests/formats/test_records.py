@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from formats import errors
-from formats.records import MAX_HEADER, FieldRecord, decode_field, decode_header, encode_field
+from formats.field_header import MAX_HEADER, decode_header
+from formats.records import FieldRecord, decode_field, encode_field
 
 CONTENT = {"kind": "dense", "metadata": {}, "version": 1}
 SIGMA = {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}

@@ -174,7 +174,7 @@ def numbers(make: Callable, **where) -> Callable[[Path], None]:
 
 
 def write(path: Path, made, precision: str = "float16", origin=None, **more) -> None:
-    from fusedrf_cli.bridge.scene import write_field
+    from fusedrf_cli.bridge.field_bundle import write_field
 
     write_field(str(path), made, path.stem, precision=precision, overwrite=True, origin=origin, **more)
 
@@ -250,9 +250,7 @@ def walls(shape=None, hashed: bool = True, resolution: int = 17, seed: int = 0):
 
     generator = torch.Generator().manual_seed(seed)
     detail = HashGrid((1.0, 0.5), 256) if hashed else None
-    made = VMField.create(
-        replace(shape or THIRTY_TWO, hashed=detail), WHOLE, (resolution,) * 3, generator
-    )
+    made = VMField.create(replace(shape or THIRTY_TWO, hashed=detail), WHOLE, (resolution,) * 3, generator)
     if hashed:
         made.sections()["density_detail"].normal_(0, 0.3, generator=generator)
     grid = OccupancyGrid.full(WHOLE, 16, unbounded)

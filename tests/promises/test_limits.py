@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from formats import errors, records, safe_input, scene
+from formats import errors, field_header, safe_input, scene
 from formats.archive import MAX_MEMBERS, write_archive
 from formats.bundle import member_name
 from formats.camera_set import MAX_CAMERAS
+from formats.field_header import MAX_HEADER
 from formats.names import MAX_NAME_BYTES
-from formats.records import MAX_HEADER
 from formats.scene import SceneGraph, dump_scene, make_node, parse_scene, write_scene
 from formats.sources import expand_scene
 from tests.formats.test_records import HOSTILE as BAD_FIELDS
@@ -264,4 +264,4 @@ def test_limits_are_those_of_the_specification():
     assert (MAX_MEMBERS, MAX_HEADER, scene.MAX_SCENE_BYTES) == (10_001, 1 << 20, 4 << 20)
     assert f"{safe_input.MAX_VALUES:,}" in spec and f"{safe_input.MAX_KEYS:,}" in spec
     assert f"{safe_input.MAX_NESTING} levels" in spec
-    assert "those of a field 8 GiB" in spec and records.MAX_DECODED_BYTES == 8 << 30
+    assert "those of a field 8 GiB" in spec and field_header.MAX_DECODED_BYTES == 8 << 30

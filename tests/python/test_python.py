@@ -14,7 +14,8 @@ from formats.bundle import BundleWriter
 from formats.errors import FormatError, OutputExists
 from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge.scene import graph_of, load_scene, write_field
+from fusedrf_cli.bridge.field_bundle import graph_of, write_field
+from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.composition.composite import as_composite
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.rendering.volume import render_image

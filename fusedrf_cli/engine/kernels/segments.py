@@ -14,7 +14,7 @@ from fusedrf_cli.engine.kernels.bundles import fewer_near, instances_near, ray_r
 from fusedrf_cli.engine.kernels.field_free import loop, serial
 from fusedrf_cli.engine.kernels.instances import ANYWHERE, DENSER
 from fusedrf_cli.engine.kernels.primitives import FARTHEST, device
-from fusedrf_cli.engine.kernels.specialise import inlined, loops_for, rebound
+from fusedrf_cli.engine.kernels.specialise import compile_into, loops_for, rebound
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
 GAP = 4.0  # steps: occupied cells that are no farther apart belong together
@@ -203,11 +203,10 @@ def segments_loop_in(spaces: tuple[ModuleType, ...]):
     names = globals() | {
         "next_in_space": next_in_any([one.names["next_change"] for one in loops], tag, serial)
     }
-    for function in (next_on_ray, occupied_from, first_two, end_of_meeting, note_meeting, segment_of):
-        name = function.py_func.__name__
-        names[name] = inlined(rebound(function.py_func, names, tag))
-    names["segment_task"] = serial(rebound(segment_task.py_func, names, tag))
-    return loop(rebound(segments_loop.py_func, names, tag))
+    parts = next_on_ray, occupied_from, first_two, end_of_meeting, note_meeting, segment_of
+    parts = {part.py_func.__name__: part.py_func for part in (*parts, segment_task, segments_loop)}
+    compile_into(names, parts, {"segment_task": serial, "segments_loop": loop})
+    return names["segments_loop"]
 
 
 # -- slots and rays ------------------------------------------------------------------------------------------

@@ -5,13 +5,16 @@ names mean this kind's functions and this field's sizes. Closures would do as we
 captures functions again in every process.
 """
 
+import dis
 import hashlib
 import sys
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 
 from numba import get_num_threads, njit
+from numba.core.dispatcher import Dispatcher
 
 from fusedrf_cli.engine.kernels import instances, learning, light, loops, primitives
 from fusedrf_cli.engine.kernels.field_free import FLAGS, loop, serial
@@ -46,8 +49,7 @@ class Loops:
         run = self.runs.get((loop_name, item))
         if run is None:
             names = {**self.names, "item": self.names[item]}
-            for name in (f"{loop_name}_task", loop_name):
-                names[name] = ROLES[name](rebound(getattr(loops, name), names, f"{self.tag}_{item}"))
+            compile_into(names, {name: getattr(loops, name) for name in (f"{loop_name}_task", loop_name)})
             run = self.runs[loop_name, item] = names[loop_name]
         return run
 
@@ -70,10 +72,18 @@ def specialised(
             f"{device_module.__name__} follows straight rays, which {space.__name__} has none of"
         )
     names |= sizes
-    tag = combination(device_module, sizes, space, names)
+    digests = compile_into(names, functions)
+    kind = device_module.__name__.split(".")[-2] if device_module and "." in device_module.__name__ else "any"
+    return f"{kind}_{digest(*sorted(digests.values()))}", names
+
+
+def compile_into(names: dict, functions: dict[str, FunctionType], roles: dict = ROLES) -> dict[str, str]:
+    """Put functions into a namespace as numba's, and return their digests by name."""
+    meanings = Meanings(names, functions)
+    digests = {name: meanings.of(name) for name in functions}
     for name, function in functions.items():
-        names[name] = ROLES.get(name, inlined)(rebound(function, names, tag))
-    return tag, names
+        names[name] = compiled(roles.get(name, inlined), function, names, digests[name])
+    return digests
 
 
 def namespace(device_module: ModuleType | None, space: ModuleType) -> tuple[dict, dict[str, FunctionType]]:
@@ -104,21 +114,64 @@ def rebound(function: FunctionType, names: dict, tag: str) -> FunctionType:
     return copy
 
 
-def combination(
-    device_module: ModuleType | None, sizes: dict[str, int], space: ModuleType, names: dict
-) -> str:
-    """A name of its own for a kind's module, sizes and space, and for the text of all files that their
-    functions come from: numba looks for changes only in the file of the loop, not of what it inlines."""
-    files = {getattr(f, "py_func", f).__code__.co_filename for f in names.values() if is_compilable(f)}
-    text = [device_module.__name__ if device_module else "", space.__name__, repr(sorted(sizes.items()))]
-    text += [text_digest(file) for file in sorted(files)]
-    kind = device_module.__name__.split(".")[-2] if device_module and "." in device_module.__name__ else "any"
-    return f"{kind}_{hashlib.sha256(' '.join(text).encode()).hexdigest()[:16]}"
+made: dict[tuple, Dispatcher] = {}
+"""By role, name and meaning."""
 
 
-def is_compilable(value: object) -> bool:
-    """Whether a name is a plain function or one of numba's."""
-    return isinstance(getattr(value, "py_func", value), FunctionType)
+def compiled(role: Callable, function: FunctionType, names: dict, tag: str) -> Dispatcher:
+    """A function of a namespace as numba's, made once for all namespaces in which it means the same."""
+    key = role, function.__name__, tag
+    if key not in made:
+        made[key] = role(rebound(function, names, tag))
+    return made[key]
+
+
+class Meanings:
+    """What the functions of a namespace do, each with all that it calls and reads: a digest by name. Numba
+    looks for changes only in the file of a loop, not of what it inlines."""
+
+    def __init__(self, names: dict, functions: dict[str, FunctionType]):
+        self.names, self.functions, self.known = names, functions, {}
+
+    def of(self, name: str) -> str:
+        """The digest of what a global name of these functions means."""
+        if name not in self.known:
+            function = self.functions.get(name)
+            self.known[name] = (
+                meaning(self.names.get(name)) if function is None else self.of_function(function)
+            )
+        return self.known[name]
+
+    def of_function(self, function: FunctionType) -> str:
+        """The digest of a function's code and of what its names mean."""
+        text, used = code_text(function.__code__, function.__doc__)
+        return digest(text, repr(function.__defaults__), *map(self.of, used))
+
+
+@cache
+def code_text(code: CodeType, doc: str | None) -> tuple[str, tuple[str, ...]]:
+    """What code does but for the global names in it, and these in the order of their use."""
+    used = tuple(dict.fromkeys(i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL"))
+    places = {name: f"global {place}" for place, name in enumerate(used)}
+    consts = [const for const in code.co_consts if const != doc]
+    text = [code.co_code.hex(), repr(consts), repr([places.get(name, name) for name in code.co_names])]
+    return " ".join([*text, repr(code.co_varnames), repr(code.co_argcount)]), used
+
+
+def meaning(value: object) -> str:
+    """The digest of what is no function of a namespace: of a function, of its file's text and its name."""
+    function = getattr(value, "py_func", value)
+    if isinstance(function, FunctionType):
+        return digest(text_digest(function.__code__.co_filename), function.__qualname__)
+    if isinstance(value, type | ModuleType | BuiltinFunctionType):
+        return digest(repr(value), repr(getattr(value, "_fields", "")))
+    definition = getattr(value, "_defn", None)  # numba's intrinsics
+    return digest(repr(value)) if definition is None else meaning(definition)
+
+
+def digest(*texts: str) -> str:
+    """One digest of several texts."""
+    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]
 
 
 @cache

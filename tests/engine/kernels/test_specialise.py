@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from types import ModuleType
+from types import FunctionType, ModuleType
 
 import pytest
 
@@ -11,7 +11,7 @@ from fusedrf_cli.engine.decoders import density_sum, sh, sh_basis
 from fusedrf_cli.engine.encodings import bricks, line, plane_line
 from fusedrf_cli.engine.kernels import instances, learning, light, loops, primitives, specialise
 from fusedrf_cli.engine.kernels.assembled import assemble
-from fusedrf_cli.engine.spaces import SPACES, bounded
+from fusedrf_cli.engine.spaces import SPACES, bounded, unbounded
 from tests.engine.kinds.cases import KINDS
 
 VM = assemble(plane_line, plane_line, density_sum, sh_basis)
@@ -139,16 +139,49 @@ def tag(device_module: ModuleType = VM, sizes: dict = SIZES, space: ModuleType =
 
 
 def test_kinds_sizes_and_spaces_have_names_of_their_own():
-    other_space = ModuleType("elsewhere")
-    other_space.__dict__.update({k: v for k, v in vars(bounded).items() if k != "__name__"})
-    tags = [tag(), tag(SPARSE), tag(CP), tag(sizes=SIZES | {"RANK": 16}), tag(space=other_space)]
+    sizes = [SIZES | {"density_RANK": rank} for rank in (8, 16)]
+    tags = [tag(), tag(SPARSE), tag(CP), *(tag(sizes=each) for each in sizes), tag(space=unbounded)]
     assert len(set(tags)) == len(tags) and tag() == tags[0]
 
 
-def test_every_function_carries_the_name():
-    name, names = specialise.specialised(VM, SIZES, bounded)
-    for function in ("density", "colour", "query_point", "train_ray", "piece", "march"):
-        assert names[function].py_func.__qualname__ == f"{function}_{name}"
+def test_what_means_the_same_is_compiled_once():
+    """And what reads a size, or calls what does, for each size."""
+    (_, few), (_, more) = (specialise.specialised(VM, SIZES | {"density_RANK": n}, bounded) for n in (8, 16))
+    own = {"density", "query_point", "train_ray", "peak_of_cell"}
+    assert all(few[name] is not more[name] for name in own)
+    assert all(few[name] is more[name] for name in ("piece", "next_sample", "march_ray", "march"))
+    _, others = specialise.specialised(CP, SIZES, bounded)
+    assert others["march"] is few["march"] and others["sh_basis"] is few["sh_basis"]
+    _, curved = specialise.specialised(VM, SIZES | {"density_RANK": 8}, unbounded)
+    assert curved["density_forward"] is few["density_forward"] and curved["march"] is not few["march"]
+
+
+def test_a_meaning_is_what_a_function_does():
+    """Not how it is called, nor what is said of it, but all that it reads and calls."""
+
+    def meaning_of(text: str, **names) -> str:
+        exec(text, names)
+        functions = {n: f for n, f in names.items() if isinstance(f, FunctionType)}
+        return specialise.Meanings(names, functions).of("f")
+
+    plain = meaning_of("def f(x): return x + A", A=1)
+    assert plain == meaning_of("def f(x):\n    'Said.'\n    return x + B", B=1)
+    others = [
+        meaning_of("def f(x): return x + A", A=2),
+        meaning_of("def f(x): return x - A", A=1),
+        meaning_of("def f(x): return x.A + A", A=1),
+        meaning_of("def f(x, y=1): return x + A", A=1),
+        meaning_of("def f(x): return x + 1", A=1),
+        meaning_of("def g(x): return x + 1\ndef f(x): return g(x)"),
+        meaning_of("def g(x): return x + A\ndef f(x): return g(x)", A=1),
+        meaning_of("def g(x): return x + A\ndef f(x): return g(x)", A=2),
+        meaning_of("def f(x): return g(x)", g=max),
+        meaning_of("def f(x): return g(x)", g=min),
+    ]
+    assert len({plain, *others}) == 1 + len(others)
+
+
+def test_every_loop_carries_the_name_of_its_item():
     runs = specialise.Loops(VM, SIZES, bounded)
     runs = [runs._over("each", item) for item in ("query_point", "show_ray")]
     assert len({run.py_func.__qualname__ for run in runs}) == 2
@@ -178,8 +211,8 @@ def test_no_name_means_two_things_in_a_namespace(name, space):
 
 def test_what_a_kind_leaves_out_has_a_default():
     _, names = specialise.specialised(SPARSE, SIZES, bounded)
-    assert names["ray_backward"].py_func.__code__ is SPARSE.ray_backward.__code__
-    assert names["next_index"].py_func.__code__ is SPARSE.next_index.__code__
+    assert names["ray_backward"].py_func.__code__ == SPARSE.ray_backward.__code__
+    assert names["next_index"].py_func.__code__ == SPARSE.next_index.__code__
     _, names = specialise.specialised(CP, SIZES, bounded)
-    assert names["next_index"].py_func.__code__ is loops.next_index.__code__
-    assert names["ray_backward"].py_func.__code__ is CP.ray_backward.__code__
+    assert names["next_index"].py_func.__code__ == loops.next_index.__code__
+    assert names["ray_backward"].py_func.__code__ == CP.ray_backward.__code__

@@ -11,7 +11,7 @@ import torch
 
 from formats.errors import FormatError
 from formats.records import FieldRecord, decode_field, encode_field
-from fusedrf_cli.bridge.scene import stored
+from fusedrf_cli.bridge.field_bundle import stored
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.encodings import plane_line
