@@ -189,7 +189,7 @@ def test_photos_are_learnt_from_once(report, picture, folder, monkeypatch):
     learnt, deleting = [], part("deleting")
     once = deleting.learnt_from
     monkeypatch.setattr(deleting, "learnt_from", lambda *words: learnt.append(words) or once(*words))
-    words = ("--refit", "place", "--time-budget", "4", "--no-finetune")
+    words = ("--refit", "place", "--no-finetune")
     said = report("delete", "vm.rfpack", "red", "blue", *words, "-o", "less.rfpack")
     assert said["restored"] is True and len(learnt) == 1
 

@@ -1,5 +1,6 @@
 """`extract` for real: an object out of a field, and what is left without it."""
 
+import itertools
 import json
 import shutil
 
@@ -101,8 +102,14 @@ def iou(folder, bundle: str) -> float:
     return min((f & t).sum() / (f | t).sum() for f, t in zip(found, true, strict=True))
 
 
-@pytest.mark.parametrize("kind", ["blocks", "vm", "sparse", "dense"])
-@pytest.mark.parametrize("way", WAYS)
+QUICK = {("blocks", "masks"), ("vm", "box"), ("sparse", "masks"), ("dense", "box")}
+EACH_WAY = [
+    pytest.param(kind, way, marks=[] if (kind, way) in QUICK else pytest.mark.slow)
+    for kind, way in itertools.product(("blocks", "vm", "sparse", "dense"), WAYS)
+]
+
+
+@pytest.mark.parametrize("kind, way", EACH_WAY)
 def test_the_object_is_it_and_with_the_rest_it_is_the_field(report, folder, kind, way):
     said = report("extract", f"{kind}.rfpack", *WAYS[way], "-o", "object.rfpack")
     report("extract", f"{kind}.rfpack", *WAYS[way], "--invert", "-o", "rest.rfpack")

@@ -129,12 +129,12 @@ def test_what_takes_long_is_said_before_it_begins(run, folder, in_force):
     """Many pixels, or a node so small beside another that each ray takes very many samples."""
     nodes = [
         make_node("whole", source="red.rfpack"),
-        make_node("tiny", source="blue.rfpack", scale=[1e-4] * 3),
+        make_node("tiny", source="blue.rfpack", scale=[1e-3] * 3),
     ]
     write_scene(folder / "tiny.json", SceneGraph(tuple(nodes)))
     few = "render", "tiny.json", "-o", "out.png", "-w", "--reference", "--size", "2x2"
     assert run(*few).stderr.count("may take long") == 0
-    in_force(WorkConfig(much_work=1 << 16))
+    in_force(WorkConfig(much_work=1 << 12))
     said = run(*few).stderr
     assert "Warning: tiny.json: a ray takes up to " in said and "leave out what is smallest" in said
     assert run("render", "red.rfpack", "-o", "red.png", *SMALL).stderr.count("Warning") == 0

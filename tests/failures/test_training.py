@@ -204,10 +204,11 @@ def test_t7_numbers_that_are_not_finite_never_reach_the_grid(row, images):
     assert torch.equal(run.field.params, good)
 
 
-def test_t9_bad_steps_are_skipped(row, images, unseen_psnr, monkeypatch):
+@pytest.mark.parametrize("seeds", [1, pytest.param(8, marks=pytest.mark.slow)])
+def test_t9_bad_steps_are_skipped(row, images, unseen_psnr, monkeypatch, seeds):
     """One step in twenty is NaN: not a bit of what is learnt changes by it, and beside runs of as many good
     steps 0.5 dB is lost at most, on the average of eight seeds: two runs differ by as much."""
-    clean = [replace(BRIEF, steps=152, seed=seed) for seed in range(8)]
+    clean = [replace(BRIEF, steps=152, seed=seed) for seed in range(seeds)]
     figure = np.mean([unseen_psnr(fit(CAMERAS, images, BOX, settings)) for settings in clean])
     train_rays, calls = ComputedField.train_rays, []
 
@@ -234,7 +235,8 @@ def test_t9_bad_steps_are_skipped(row, images, unseen_psnr, monkeypatch):
         figure -= unseen_psnr(run.finish()) / len(clean)
         assert run.nan_guard.figures() == {"skipped_steps": 8, "roll_backs": 0} and run.steps == 160
         assert np.isfinite(run.mse)
-    row.check("T9", "PSNR lost to one bad step in twenty", figure, 0.5, at_most=True, unit="dB")
+    if seeds > 1:
+        row.check("T9", "PSNR lost to one bad step in twenty", figure, 0.5, at_most=True, unit="dB")
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30])
@@ -266,6 +268,7 @@ def test_t11_rays_without_samples(row, images):
     assert torch.equal(run.field.params, before)
 
 
+@pytest.mark.slow
 def test_t12_no_seed_fails(row, images, unseen_psnr):
     found = [unseen_psnr(fit(CAMERAS, images, BOX, replace(LONG, seed=seed))) for seed in range(5)]
     figure = np.mean(found) - 2 * np.std(found, ddof=1)

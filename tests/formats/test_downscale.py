@@ -1,5 +1,7 @@
 """Photos made smaller on reading: means of whole pixels, and cameras that show the same."""
 
+import shutil
+
 import numpy as np
 import pytest
 from PIL import Image as Pillow
@@ -66,6 +68,16 @@ def test_small_photos_stay(tmp_path):
 
 
 COPIES = {"images": (2000, 1600), "images_2": (1000, 800), "images_8": (250, 200)}
+COPIED = ["a.png", "b.png", "c.png"]
+
+
+@pytest.fixture(scope="module")
+def copies(tmp_path_factory):
+    """A folder of photos and smaller copies of them."""
+    folder = tmp_path_factory.mktemp("copies")
+    for copy, size in COPIES.items():
+        photos(folder / copy, COPIED, size)
+    return folder
 
 
 @pytest.mark.parametrize(
@@ -80,14 +92,12 @@ COPIES = {"images": (2000, 1600), "images_2": (1000, 800), "images_8": (250, 200
     ],
 )
 @pytest.mark.parametrize("kind", ["transforms", "colmap", "llff"])
-def test_copies_go_before_making_smaller(tmp_path, kind, downscale, folder, reduction):
-    names = ["a.png", "b.png", "c.png"]
-    for copy, size in COPIES.items():
-        photos(tmp_path / copy, names, size)
+def test_copies_go_before_making_smaller(tmp_path, copies, kind, downscale, folder, reduction):
+    shutil.copytree(copies, tmp_path, dirs_exist_ok=True)
     if kind == "transforms":
-        write(tmp_path, frames=[frame(f"images/{name}") for name in names], fl_x=1600, w=2000, h=1600)
+        write(tmp_path, frames=[frame(f"images/{name}") for name in COPIED], fl_x=1600, w=2000, h=1600)
     elif kind == "colmap":
-        binary_model(tmp_path / "sparse/0", names, params=(1600, 1600, 1000, 800), size=(2000, 1600))
+        binary_model(tmp_path / "sparse/0", COPIED, params=(1600, 1600, 1000, 800), size=(2000, 1600))
     else:
         np.save(tmp_path / "poses_bounds.npy", llff_rows(3, (2000, 1600), 1600.0))
     view = read_capture(tmp_path, downscale).train[0]

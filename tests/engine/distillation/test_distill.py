@@ -135,8 +135,12 @@ def test_a_student_that_holds_nothing_yet_keeps_its_cells(monkeypatch):
     np.testing.assert_array_equal(student.occupancy.occupied, TEACHER.occupancy.occupied)
 
 
-@pytest.mark.parametrize("coarse_from", [16, 64])
-@pytest.mark.parametrize("at", [0, 3, 6, 7, 20, 25, 30])
+SLOW_AT = [
+    pytest.param(at, coarse, marks=pytest.mark.slow) for at in (0, 6, 7, 20, 30) for coarse in (16, 64)
+]
+
+
+@pytest.mark.parametrize("at, coarse_from", [(3, 16), (3, 64), (20, 64), (25, 16), *SLOW_AT])
 def test_a_restored_run_goes_on_to_the_same_bits(monkeypatch, at, coarse_from):
     """Stopped before the first step, in the points (20 steps, of which the first six may be coarse), in the
     pictures (10) and after the last; the schedule looks every fourth step."""

@@ -107,6 +107,7 @@ def test_poses_of_which_little_is_seen_stay():
     assert np.isfinite(change).all()
 
 
+@pytest.mark.slow
 def test_what_is_learnt_from_inexact_poses_is_sharper():
     """Poses end nearer to the true ones, but for what all have in common, and the photos, which the ball
     fills, are shown better."""
