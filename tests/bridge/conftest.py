@@ -18,6 +18,7 @@ from formats.images import read_image
 from formats.scene import SceneGraph, make_node, write_scene
 from formats.views import View
 from fusedrf_cli.bridge.building import BuildingConfig
+from fusedrf_cli.bridge.evaluating import EvaluationConfig
 from fusedrf_cli.bridge.evaluation_views import EvaluationViewConfig
 from fusedrf_cli.bridge.field_bundle import write_field
 from fusedrf_cli.bridge.inpainting import InpaintingConfig
@@ -104,6 +105,7 @@ DRAFT = TrainConfig(longest=24, steps=60, samples=1 << 13, steps_to_show=1)
 TINY = (
     OccupancyConfig(scene_cells=48),
     EvaluationViewConfig(whole=2, most_objects=0),
+    EvaluationConfig(size=(96, 96)),
     BuildingConfig(views=2),
     VMBuilderConfig(SHAPE),
     InpaintingConfig(None, settings=TinySettings(), numbers=VMField.size_of(SHAPE, (20, 20, 20))),

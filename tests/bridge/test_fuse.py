@@ -190,6 +190,7 @@ def test_a_fuse_goes_on_to_the_same_bytes(report, run, folder, interrupted_in_st
     assert (folder / "fused.rfpack").read_bytes() == straight
 
 
+@pytest.mark.slow
 def test_a_kind_that_is_made_goes_on_to_the_same_bytes(report, run, folder, interrupted_in_step):
     """It learns from pictures alone; another kind does not go on from its numbers."""
     words = ("fuse", "pair.json", "--kind", "sparse", "--max-size", "100kB", "-o")

@@ -79,6 +79,7 @@ def test_a_file_is_filled_and_no_more_than_that(report, limit):
     assert 0.75 * limit < said["bytes"] <= limit
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_bytes(report, folder):
     for name in ("one", "two"):
         report("fuse", "pair.json", "-o", f"{name}.rfpack", *SPARSE)

@@ -224,7 +224,7 @@ def test_photos_that_do_not_differ_stay_as_they_are():
 def test_a_run_is_taken_up_with_its_gains(drifting):
     """Saved half way and taken up again it ends with the same bits."""
     cameras, _, photos, _ = drifting
-    settings = replace(LONG, exposure=True, steps=300)
+    settings = replace(LONG, exposure=True, steps=150)
     whole = FitRun.start(cameras, photos, BOX, settings)
     whole.finish()
     assert spread(whole.maps[:, 0]) > 0.05

@@ -87,7 +87,7 @@ def test_poses_are_found_again_from_what_a_field_shows(pixels):
 
     before, generator = off(), torch.Generator().manual_seed(2)
     for probe in (4.0, 4.0, 3.0, 2.0, 2.0, 1.0, 1.0, 0.5, 0.5, 0.5):
-        *rays, colours = dataset.sample(1500, generator)
+        *rays, colours = dataset.sample(800, generator)
         dataset.set_poses(
             changed_each(dataset.poses, refined(BALL, rays, colours, 0.0, probe * dataset.pixel))
         )
