@@ -15,7 +15,7 @@ from fusedrf_cli.engine.rendering.volume import reach_of, render_rays
 from fusedrf_cli.engine.spaces import contracted_linf
 from tests.analytic.export import exported
 from tests.analytic.fields import Gaussian, Tint
-from tests.analytic.rays import affine, unit
+from tests.analytic.rays import unit
 
 from .test_contractions import by_python
 
@@ -75,7 +75,7 @@ def test_the_layer_lies_behind_what_a_scene_shows(rule):
     """Far behind, where its node is large."""
     field, _ = layer(torch.float32)
     ball = exported(Gaussian(4.0, tint=Tint.of(0.1, 0.2, 0.9)), "vm", (25, 25, 25))
-    scene = Composite([Placed("sky", field, affine(50.0)), Placed("ball", ball, np.eye(4))], rule)
+    scene = Composite([Placed("sky", field, np.diag([50.0, 50.0, 50.0, 1.0])), Placed("ball", ball, np.eye(4))], rule)
     dirs = some_dirs(100)
     origins = -3 * dirs + 0.2 * np.random.default_rng(1).normal(size=dirs.shape)
     sky = render_rays(field, origins / 50, dirs, early_stop=0.0)
