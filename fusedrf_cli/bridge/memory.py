@@ -35,7 +35,7 @@ class MemoryConfig:
     """Bytes, but for copies and shares, that work takes."""
 
     share_of_free: float = 0.8
-    compiled: int = 100 << 20
+    compiled: int = 50 << 20
     """Kernels, once they are loaded, and the libraries that come with them."""
     reading: float = 1.5
     """Copies of a field's numbers while it is read: decoded arrays, and the file's pages."""

@@ -163,7 +163,9 @@ def meaning(value: object) -> str:
     function = getattr(value, "py_func", value)
     if isinstance(function, FunctionType):
         return digest(text_digest(function.__code__.co_filename), function.__qualname__)
-    if isinstance(value, type | ModuleType | BuiltinFunctionType):
+    if isinstance(value, ModuleType):
+        return digest(value.__name__)
+    if isinstance(value, type | BuiltinFunctionType):
         return digest(repr(value), repr(getattr(value, "_fields", "")))
     definition = getattr(value, "_defn", None)  # numba's intrinsics
     return digest(repr(value)) if definition is None else meaning(definition)

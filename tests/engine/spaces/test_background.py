@@ -75,7 +75,8 @@ def test_the_layer_lies_behind_what_a_scene_shows(rule):
     """Far behind, where its node is large."""
     field, _ = layer(torch.float32)
     ball = exported(Gaussian(4.0, tint=Tint.of(0.1, 0.2, 0.9)), "vm", (25, 25, 25))
-    scene = Composite([Placed("sky", field, np.diag([50.0, 50.0, 50.0, 1.0])), Placed("ball", ball, np.eye(4))], rule)
+    far = np.diag([50.0, 50.0, 50.0, 1.0])
+    scene = Composite([Placed("sky", field, far), Placed("ball", ball, np.eye(4))], rule)
     dirs = some_dirs(100)
     origins = -3 * dirs + 0.2 * np.random.default_rng(1).normal(size=dirs.shape)
     sky = render_rays(field, origins / 50, dirs, early_stop=0.0)
