@@ -134,28 +134,27 @@ class Meanings:
         self.names, self.functions, self.known = names, functions, {}
 
     def of(self, name: str) -> str:
-        """The digest of what a global name of these functions means."""
+        """The digest of what a global name of these functions means; one that is not here is Python's."""
         if name not in self.known:
-            function = self.functions.get(name)
-            self.known[name] = (
-                meaning(self.names.get(name)) if function is None else self.of_function(function)
-            )
+            if name in self.functions:
+                self.known[name] = self.of_function(self.functions[name])
+            else:
+                self.known[name] = meaning(self.names[name]) if name in self.names else digest(name)
         return self.known[name]
 
     def of_function(self, function: FunctionType) -> str:
         """The digest of a function's code and of what its names mean."""
-        text, used = code_text(function.__code__, function.__doc__)
+        text, used = code_text(function.__code__)
         return digest(text, repr(function.__defaults__), *map(self.of, used))
 
 
 @cache
-def code_text(code: CodeType, doc: str | None) -> tuple[str, tuple[str, ...]]:
+def code_text(code: CodeType) -> tuple[str, tuple[str, ...]]:
     """What code does but for the global names in it, and these in the order of their use."""
     used = tuple(dict.fromkeys(i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL"))
     places = {name: f"global {place}" for place, name in enumerate(used)}
-    consts = [const for const in code.co_consts if const != doc]
-    text = [code.co_code.hex(), repr(consts), repr([places.get(name, name) for name in code.co_names])]
-    return " ".join([*text, repr(code.co_varnames), repr(code.co_argcount)]), used
+    names = [places.get(name, name) for name in code.co_names]
+    return repr((code.co_code, code.co_consts, names, code.co_varnames, code.co_argcount)), used
 
 
 def meaning(value: object) -> str:
