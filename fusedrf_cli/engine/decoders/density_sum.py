@@ -3,11 +3,13 @@ shift), `a` of activations.py."""
 
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.decoders import activations
 from fusedrf_cli.engine.decoders.activations import activated, activated_slope
+from fusedrf_cli.engine.fields.part_options import Activation, Limits
 
 
 class Arrays(NamedTuple):
@@ -16,24 +18,29 @@ class Arrays(NamedTuple):
     activation: object  # (2,) float, scale (1/length) and shift
 
 
-def sizes(activation: str = "softplus") -> dict[str, int]:
+class Options(msgspec.Struct, forbid_unknown_fields=True):
+    """See decoders."""
+
+    activation: Activation = "softplus"
+    limits: Limits = activations.LIMITS
+
+
+def sizes(**activation) -> dict[str, int | float]:
     """See decoders; scratch holds the gradient of the sum."""
-    return {"ACTIVATION": activations.NAMES.index(activation), "ROOM": 1}
+    return activations.sizes(**activation) | {"ROOM": 1}
 
 
-def arrays(field, starts: np.ndarray, activation: str = "softplus") -> Arrays:
+def arrays(field, starts: np.ndarray, **activation) -> Arrays:
     """See decoders."""
     return Arrays(field.activation)
 
 
-def reference(
-    field, sections: dict, features: torch.Tensor, activation: str = "softplus"
-) -> tuple[torch.Tensor, None]:
+def reference(field, sections: dict, features: torch.Tensor, **activation) -> tuple[torch.Tensor, None]:
     """See decoders."""
-    return field.scale * activations.reference(activation, features.sum(1) + field.shift), None
+    return field.scale * activations.reference(features.sum(1) + field.shift, **activation), None
 
 
-def bound(field, sections: dict, features: torch.Tensor, activation: str = "softplus") -> tuple[float, None]:
+def bound(field, sections: dict, features: torch.Tensor, **activation) -> tuple[float, None]:
     """See decoders."""
     return float(features.sum()), None
 

@@ -1,7 +1,12 @@
 """Colour that is the same from all sides: the logits are the first three features (DVGO, Sun
 et al., CVPR 2022)."""
 
+import msgspec
 import torch
+
+
+class Options(msgspec.Struct, forbid_unknown_fields=True):
+    """See decoders."""
 
 
 def sizes(width: int) -> dict[str, int]:

@@ -2,10 +2,19 @@
 2022): logit_c = Σ_k Y_k(d) features[c, k]. Where they stand `apart`, the first features are those of degree
 1 and more, channel by channel, and the last three those of degree 0."""
 
+import msgspec
 import torch
 
+from fusedrf_cli.engine.fields.part_options import Coefficients
 from fusedrf_cli.engine.kernels import reference as torch_reference
 from fusedrf_cli.engine.kernels.primitives import sh_basis
+
+
+class Options(msgspec.Struct, forbid_unknown_fields=True):
+    """See decoders."""
+
+    coefficients: Coefficients
+    apart: bool = False
 
 
 def sizes(width: int, coefficients: int, apart: bool = False) -> dict[str, int]:

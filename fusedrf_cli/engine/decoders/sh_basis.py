@@ -3,12 +3,20 @@ logit_c = Σ_r features_r Σ_k Y_k(d) B[c, k, r]. SH is linear: a ray folds its 
 
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.box import ParameterBlock, largest
+from fusedrf_cli.engine.fields.part_options import Coefficients
 from fusedrf_cli.engine.kernels import reference as torch_reference
 from fusedrf_cli.engine.kernels.primitives import add_scaled, dot, mixed_8, scatter, sh_basis
+
+
+class Options(msgspec.Struct, forbid_unknown_fields=True):
+    """See decoders."""
+
+    coefficients: Coefficients
 
 
 class Arrays(NamedTuple):

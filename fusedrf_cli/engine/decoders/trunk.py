@@ -1,72 +1,113 @@
 """Density by a network whose outputs are the features of the colour as well (NeRF, Mildenhall et al., ECCV
-2020; Instant-NGP, Müller et al. 2022, sec. 5.4): h = max(0, W features + b), outputs = V h + c and
-σ = scale a(outputs_0 + shift), `a` of activations.py.
+2020; Instant-NGP, Müller et al. 2022, sec. 5.4): LAYERS rectified layers of HIDDEN outputs, then
+outputs = V h + c and σ = scale a(outputs_0 + shift), `a` of activations.py. The layer SKIP, where there is
+one, reads the features again beside what the layer before it made (NeRF, fig. 7).
 
 encodings/trunk_features.py hands the outputs on. What colour sends back to them waits in scratch for
 `backward`, which is called after that of every colour."""
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
+import msgspec
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.decoders import activations
 from fusedrf_cli.engine.decoders.activations import activated, activated_slope
 from fusedrf_cli.engine.fields.box import ParameterBlock
-from fusedrf_cli.engine.kernels.primitives import dense, dense_backward, rectify
+from fusedrf_cli.engine.fields.part_options import Activation, Layers, Limits, Width
+from fusedrf_cli.engine.kernels.primitives import (
+    add_scaled,
+    dense,
+    dense_backward,
+    dot,
+    rectify,
+    scatter,
+)
+
+
+class Options(msgspec.Struct, forbid_unknown_fields=True):
+    """See decoders."""
+
+    hidden: Width
+    outputs: Width
+    layers: Layers = 1
+    skip: Annotated[int, msgspec.Meta(ge=0, le=15)] = 0
+    activation: Activation = "softplus"
+    limits: Limits = activations.LIMITS
+
+    def __post_init__(self):
+        """The first layer reads the features, and there is no other to skip to than the rest."""
+        if self.skip >= self.layers:
+            raise ValueError(f"'skip' should be a layer behind the first, found {self.skip} of {self.layers}")
 
 
 class Arrays(NamedTuple):
     """What the functions read beside `params`."""
 
-    hidden: object  # int64, where W (WIDTH, HIDDEN) begins, and behind it b
-    out: object  # int64, where V (HIDDEN, OUTPUTS) begins, and behind it c
+    layers: object  # (LAYERS + 1,) int64, where a layer's (inputs, outputs) begin, and behind them its bias
+    again: object  # int64, where the (WIDTH, HIDDEN) begin by which the layer SKIP reads the features
     activation: object  # (2,) float, scale (1/length) and shift
 
 
-def sizes(width: int, hidden: int, outputs: int, activation: str = "softplus") -> dict[str, int]:
-    """See decoders; scratch holds features, h, outputs, and the gradients of each, those of the outputs 0
-    between samples."""
-    half = width + hidden + outputs
+def sizes(
+    width: int, hidden: int, outputs: int, layers: int = 1, skip: int = 0, **activation
+) -> dict[str, int | float]:
+    """See decoders; scratch holds features, what the layers made, outputs, and the gradients of features, of
+    two layers and of the outputs, these 0 between samples. skip 0: none."""
+    rooms = {
+        "X": width, "H": layers * hidden, "OUT": outputs, "D_X": width, "D_H": hidden, "D_BEFORE": hidden,
+        "D_OUT": outputs, "D_AGAIN": width if skip else 0,
+    }  # fmt: skip
+    starts = np.cumsum([0, *rooms.values()]).tolist()
     return {
-        "WIDTH": width, "HIDDEN": hidden, "OUTPUTS": outputs, "H": width, "OUT": width + hidden, "D_X": half,
-        "D_H": half + width, "D_OUT": half + width + hidden, "ROOM": 2 * half,
-        "ACTIVATION": activations.NAMES.index(activation),
+        "WIDTH": width, "HIDDEN": hidden, "OUTPUTS": outputs, "LAYERS": layers, "SKIP": skip,
+        **dict(zip(rooms, starts, strict=False)), "ROOM": starts[-1], **activations.sizes(**activation),
     }  # fmt: skip
 
 
 def sections(
-    resolution: tuple, width: int, hidden: int, outputs: int, activation: str = "softplus"
+    resolution: tuple, width: int, hidden: int, outputs: int, layers: int = 1, skip: int = 0, **activation
 ) -> list[ParameterBlock]:
-    """See decoders; each layer's (inputs, outputs), and its bias."""
-    return [
-        ParameterBlock("hidden.weight", (width, hidden), spread=(2 / width) ** 0.5),
-        ParameterBlock("hidden.bias", (hidden,)),
-        ParameterBlock("out.weight", (hidden, outputs), spread=hidden**-0.5),
-        ParameterBlock("out.bias", (outputs,)),
+    """See decoders; (inputs, outputs) of each layer, whose bias is the last row of its array."""
+    shapes = [(width, hidden), *[(hidden, hidden)] * (layers - 1), (hidden, outputs)]
+    blocks = [
+        ParameterBlock(f"layer_{i}", (n + 1, m), spread=((2 if i < layers else 1) / n) ** 0.5)
+        for i, (n, m) in enumerate(shapes)
     ]
+    again = [ParameterBlock("again", (width, hidden), spread=(2 / width) ** 0.5)] if skip else []
+    return blocks + again
 
 
-def arrays(field, starts: np.ndarray, **options) -> Arrays:
+def arrays(field, starts: np.ndarray, layers: int = 1, skip: int = 0, **options) -> Arrays:
     """See decoders."""
-    return Arrays(np.int64(starts[0]), np.int64(starts[2]), field.activation)
+    return Arrays(starts[: layers + 1], np.int64(starts[-1] if skip else 0), field.activation)
 
 
 def reference(
-    field, sections: dict, features: torch.Tensor, activation: str = "softplus", **options
-) -> tuple[torch.Tensor, torch.Tensor]:
+    field, sections: dict, features: torch.Tensor, width: int, hidden: int, outputs: int, layers: int = 1,
+    skip: int = 0, **activation,
+) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
     """See decoders."""
-    h = (features @ sections["hidden.weight"] + sections["hidden.bias"]).relu()
-    outputs = h @ sections["out.weight"] + sections["out.bias"]
-    return field.scale * activations.reference(activation, outputs[:, 0] + field.shift), outputs
+    h = features
+    for i in range(layers + 1):
+        h = h @ sections[f"layer_{i}"][:-1] + sections[f"layer_{i}"][-1]
+        if skip and i == skip:
+            h = h + features @ sections["again"]
+        h = h.relu() if i < layers else h
+    return field.scale * activations.reference(h[:, 0] + field.shift, **activation), h
 
 
-def bound(field, sections: dict, features: torch.Tensor, **options) -> tuple[float, torch.Tensor]:
+def bound(
+    field, sections: dict, features: torch.Tensor, layers: int = 1, skip: int = 0, **options
+) -> tuple[float, torch.Tensor]:
     """See decoders."""
     most = features
-    for layer in ("hidden", "out"):
-        weight, bias = (sections[f"{layer}.{part}"].abs().double() for part in ("weight", "bias"))
-        most = most @ weight + bias
+    for i in range(layers + 1):
+        layer = sections[f"layer_{i}"].abs().double()
+        most = most @ layer[:-1] + layer[-1]
+        if skip and i == skip:
+            most = most + features @ sections["again"].abs().double()
     return float(most[0]), most
 
 
@@ -75,11 +116,20 @@ def bound(field, sections: dict, features: torch.Tensor, **options) -> tuple[flo
 
 def outputs_at(field, cell, scratch):
     """Where in scratch all outputs at a point are, computed anew."""
-    x, h, out = np.uint64(AT), np.uint64(AT + H), np.uint64(AT + OUT)
-    features_forward(field, cell, scratch, scratch, AT)
-    dense(WIDTH, HIDDEN, field.params, np.uint64(field.hidden), scratch, x, scratch, h)
+    x, h, out = np.uint64(AT + X), np.uint64(AT + H), np.uint64(AT + OUT)
+    features_forward(field, cell, scratch, scratch, AT + X)
+    dense(WIDTH, HIDDEN, field.params, np.uint64(field.layers[0]), scratch, x, scratch, h)
     rectify(HIDDEN, scratch, h)
-    dense(HIDDEN, OUTPUTS, field.params, np.uint64(field.out), scratch, h, scratch, out)
+    for layer in range(1, LAYERS):
+        above = h + np.uint64(HIDDEN)
+        dense(HIDDEN, HIDDEN, field.params, np.uint64(field.layers[layer]), scratch, h, scratch, above)
+        h = above
+        if SKIP > 0 and layer == SKIP:
+            for i in range(np.uint64(WIDTH)):
+                row = np.uint64(field.again) + i * np.uint64(HIDDEN)
+                add_scaled(HIDDEN, scratch, h, scratch[x + i], field.params, row)
+        rectify(HIDDEN, scratch, h)
+    dense(HIDDEN, OUTPUTS, field.params, np.uint64(field.layers[LAYERS]), scratch, h, scratch, out)
     return out
 
 
@@ -97,12 +147,34 @@ def forward(field, cell, scratch):
 def backward(field, cell, pre, d_sigma, scratch, grad):
     """See decoders; with what colour sent back to the outputs."""
     outputs_at(field, cell, scratch)
-    x, h, params = np.uint64(AT), np.uint64(AT + H), field.params
-    d_x, d_h, d_out = np.uint64(AT + D_X), np.uint64(AT + D_H), pending_at(scratch)
+    x, h, params = np.uint64(AT + X), np.uint64(AT + H + (LAYERS - 1) * HIDDEN), field.params
+    d_x, d_h, d_before = np.uint64(AT + D_X), np.uint64(AT + D_H), np.uint64(AT + D_BEFORE)
+    d_out = pending_at(scratch)
     scratch[d_out] += d_sigma * field.activation[0] * activated_slope(pre + field.activation[1])
-    hidden, out = np.uint64(field.hidden), np.uint64(field.out)
-    dense_backward(HIDDEN, OUTPUTS, params, out, scratch, h, True, scratch, d_out, scratch, d_h, grad)
-    dense_backward(WIDTH, HIDDEN, params, hidden, scratch, x, False, scratch, d_h, scratch, d_x, grad)
+    layer = np.uint64(field.layers[LAYERS])
+    dense_backward(HIDDEN, OUTPUTS, params, layer, scratch, h, True, scratch, d_out, scratch, d_h, grad)
+    for back in range(1, LAYERS):
+        below, layer = h - np.uint64(HIDDEN), np.uint64(field.layers[LAYERS - back])
+        dense_backward(
+            HIDDEN, HIDDEN, params, layer, scratch, below, True, scratch, d_h, scratch, d_before, grad
+        )
+        if SKIP > 0 and LAYERS - back == SKIP:
+            again_backward(field, x, d_h, scratch, grad)
+        h, d_h, d_before = below, d_before, d_h
+    dense_backward(
+        WIDTH, HIDDEN, params, np.uint64(field.layers[0]), scratch, x, False, scratch, d_h, scratch, d_x, grad
+    )
+    if SKIP > 0:
+        for i in range(np.uint64(WIDTH)):
+            scratch[d_x + i] += scratch[np.uint64(AT + D_AGAIN) + i]
     features_backward(field, cell, scratch, AT + D_X, scratch, grad)
     for r in range(np.uint64(OUTPUTS)):
         scratch[d_out + r] = 0
+
+
+def again_backward(field, x, d_h, scratch, grad):
+    """What the layer that reads the features x again sends back to them, into scratch[AT + D_AGAIN:]."""
+    for i in range(np.uint64(WIDTH)):
+        row = np.uint64(field.again) + i * np.uint64(HIDDEN)
+        scatter(HIDDEN, grad, row, scratch[x + i], scratch, d_h)
+        scratch[np.uint64(AT + D_AGAIN) + i] = dot(HIDDEN, field.params, row, scratch, d_h)

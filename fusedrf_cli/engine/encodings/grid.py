@@ -4,13 +4,21 @@ filled up to runs of eight."""
 
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.box import ParameterBlock, largest
+from fusedrf_cli.engine.fields.part_options import Numbers
 from fusedrf_cli.engine.kernels import reference as torch_reference
 from fusedrf_cli.engine.kernels.prefetch import prefetch
 from fusedrf_cli.engine.kernels.primitives import accumulate, add_scaled, scatter
+
+
+class Options(msgspec.Struct, forbid_unknown_fields=True):
+    """See encodings."""
+
+    numbers: Numbers
 
 
 class Arrays(NamedTuple):

@@ -3,12 +3,20 @@ TensoRF, Chen et al., ECCV 2022, eq. 3)."""
 
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.box import ParameterBlock, largest
+from fusedrf_cli.engine.fields.part_options import Rank
 from fusedrf_cli.engine.kernels import reference as torch_reference
 from fusedrf_cli.engine.kernels.primitives import linear, scatter, texel
+
+
+class Options(msgspec.Struct, forbid_unknown_fields=True):
+    """See encodings."""
+
+    rank: Rank
 
 
 class Arrays(NamedTuple):

@@ -3,15 +3,23 @@ line y, plane yz and line x (vector-matrix decomposition; TensoRF, Chen et al., 
 
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.box import ParameterBlock, largest
+from fusedrf_cli.engine.fields.part_options import Rank
 from fusedrf_cli.engine.kernels import reference as torch_reference
 from fusedrf_cli.engine.kernels.prefetch import prefetch_plane
 from fusedrf_cli.engine.kernels.primitives import bilinear, linear, scatter, store_8, texel
 
 MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
+
+
+class Options(msgspec.Struct, forbid_unknown_fields=True):
+    """See encodings."""
+
+    rank: Rank
 
 
 class Arrays(NamedTuple):

@@ -1,7 +1,12 @@
 """What a trunk (decoders/trunk.py) hands on to the colour: all of its outputs, the density's included."""
 
+import msgspec
 import numpy as np
 import torch
+
+
+class Options(msgspec.Struct, forbid_unknown_fields=True):
+    """See encodings."""
 
 
 def sizes(outputs: int) -> dict[str, int]:

@@ -8,6 +8,7 @@ from types import ModuleType
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.decoders import activations
 from fusedrf_cli.engine.fields.box import BoxField, ParameterBlock
 from fusedrf_cli.engine.fields.computed import ComputedField
 from fusedrf_cli.engine.kernels.assembled import assemble
@@ -99,6 +100,8 @@ class Assembled(ComputedField):
 
     slots: dict[str, Slot]
     """What fills the slots, by name, in the order of `kernels.assembled.READS`."""
+    colour_activation = "sigmoid"
+    """What makes a colour of logits: one of `decoders.activations.COLOURS`."""
 
     @property
     def cube(self) -> tuple[np.ndarray, np.ndarray]:
@@ -143,10 +146,12 @@ class Assembled(ComputedField):
         values = torch.where(held, values, 0)
         features = colour.module.reference(self, own["colour"], unit, outputs, **colour.options)
         dirs = exact(dirs, params.device)
-        logits = rgb.module.reference(self, own["rgb"], features, dirs, **rgb.options)
+        asks = {"unit": unit} if hasattr(rgb.module, "point_setup") else {}
+        logits = rgb.module.reference(self, own["rgb"], features, dirs, **asks, **rgb.options)
         if hasattr(density.module, "logits_reference"):
             logits = logits + density.module.logits_reference(self, own["density"], unit, **density.options)
-        return values, torch.where((values > 0)[:, None], logits.sigmoid(), 0)
+        rgb = activations.colour_reference(self.colour_activation, logits)
+        return values, torch.where((values > 0)[:, None], rgb, 0)
 
 
 class AssembledField(Assembled, BoxField):

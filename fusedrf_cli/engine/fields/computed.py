@@ -102,6 +102,9 @@ class ComputedField:
     resolution: tuple[int, int, int] | None = None
     """Texels per axis of a field on one grid over its box; None: it has none, and cells are not its to give
     up."""
+    over_texels = True
+    """Of a field that has `resampled`, whether all that depends on the point lies on texels, which that takes
+    to another box."""
 
     # -- for kinds to define -----------------------------------------------------------------------------
 

@@ -12,10 +12,12 @@ constants of its `sizes`, and of its module), and the fields of its `Arrays`, re
 read sigma, whose outputs can be the features of the colour.
 """
 
+import math
 from functools import cache
 from types import FunctionType, ModuleType
 from typing import NamedTuple
 
+from fusedrf_cli.engine.decoders.activations import COLOURS
 from fusedrf_cli.engine.kernels.primitives import LINE, sigmoid
 
 READS = {"density": "", "colour": "sigma", "sigma": "density", "rgb": "colour"}
@@ -86,22 +88,41 @@ def shifted_logits(field, cell, r, g, b, scratch):
 
 def colour(field, cell, p, d, scratch, memory, at):
     """See loops.py."""
+    rgb_point_setup(field, cell[0], scratch)
     r, g, b = rgb_forward(field, colour_cell(field, cell), d, scratch, memory, at)
     r, g, b = shown_logits(field, cell, r, g, b, scratch)
-    return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
+    return shown(r), shown(g), shown(b)
+
+
+def shown(x):
+    """The colour that a logit is, by the activation of decoders/activations.py."""
+    if COLOUR_ACTIVATION == 0:
+        return float(sigmoid(x))
+    if COLOUR_ACTIVATION == 1:
+        return float(max(x + 0.5, 0.0))
+    return float(x) if COLOUR_ACTIVATION == 2 else float(math.exp(min(max(x, -10.0), 10.0)))
+
+
+def shown_backward(colour, d_colour):
+    """The gradient of the logit of a colour."""
+    if COLOUR_ACTIVATION == 0:
+        return d_colour * colour * (1 - colour)
+    if COLOUR_ACTIVATION == 1:
+        return d_colour if colour > 0 else 0.0
+    return d_colour if COLOUR_ACTIVATION == 2 else d_colour * colour
 
 
 def backward(field, cell, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
     """See loops.py; colour first, since it may send back to what sigma hands on."""
     if shaded:
-        d_red, d_green = d_rgb[0] * rgb[0] * (1 - rgb[0]), d_rgb[1] * rgb[1] * (1 - rgb[1])
-        d_logits = d_red, d_green, d_rgb[2] * rgb[2] * (1 - rgb[2])
+        d_red, d_green = shown_backward(rgb[0], d_rgb[0]), shown_backward(rgb[1], d_rgb[1])
+        d_logits = d_red, d_green, shown_backward(rgb[2], d_rgb[2])
         rgb_backward(field, colour_cell(field, cell), d, d_logits, scratch, memory, at, grad)
         density_logits_backward(field, cell[1], d_logits, scratch)
     sigma_backward(field, cell[1], pre, d_sigma, scratch, grad)
 
 
-TEMPLATES = unit_of, density, unpack_cell, ray_setup, ray_backward, colour, backward
+TEMPLATES = unit_of, density, unpack_cell, ray_setup, ray_backward, colour, shown, shown_backward, backward
 
 
 # -- where an encoding has the hook that they call; else the loops' own serve --------------------------------
@@ -176,6 +197,10 @@ def logits_backward(field, cell, d_logits, scratch):
     """Nothing was added to a colour's logits."""
 
 
+def no_point_setup(field, unit, scratch):
+    """The colour asks for no point."""
+
+
 def no_ray_setup(field, d, scratch):
     """Nothing is known of a ray."""
 
@@ -188,7 +213,7 @@ HOOKS = {
     "locate": locate, "steps_at": steps_at, "located": located, "is_inside": None, "pack_cell": None,
     "unpack_cell": None, "next_index": None, "forward": None, "backward": None, "summed": None,
     "summed_backward": None, "logits": None, "logits_backward": logits_backward, "prefetch_at": None,
-    "ray_setup": no_ray_setup, "ray_backward": no_ray_backward,
+    "point_setup": no_point_setup, "ray_setup": no_ray_setup, "ray_backward": no_ray_backward,
 }  # fmt: skip
 """What the loops above and other slots call, and what serves where a module leaves it out; the rest of a
 module is reached from there."""
@@ -205,7 +230,7 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
     slots = {"density": density, "colour": colour, "sigma": sigma, "rgb": rgb}
     label = "_".join(module.__name__.split(".")[-1] for module in slots.values())
     assembly = ModuleType(f"{__name__}.{label}.device_functions")
-    names = vars(assembly) | {"sigmoid": sigmoid}
+    names = vars(assembly) | {"sigmoid": sigmoid, "math": math}
     for slot, module in slots.items():
         for name, value in slot_names(slot, module, slots.get(READS[slot]), assembly).items():
             if names.setdefault(name, value) is not value:
@@ -295,4 +320,5 @@ def constants(field) -> dict[str, int | float]:
         named |= {name if name in of_loops else f"{slot}_{name}": value for name, value in slot_sizes.items()}
         named[f"{slot}_AT"] = start
         start += -(-slot_sizes.get("ROOM", 0) // LINE) * LINE
-    return {"KEPT": 0, **named, "SCRATCH": start}
+    shown_by = COLOURS.index(field.colour_activation)
+    return {"KEPT": 0, **named, "COLOUR_ACTIVATION": shown_by, "SCRATCH": start}

@@ -164,7 +164,7 @@ def part_within(field, box: np.ndarray, narrowest: float, inside, looked_in: np.
         return None
     if field.space is unbounded and np.abs(around).max() <= 1:  # in the core coordinates are the frame's
         cells = replace(cells, space=bounded)
-    return field.resampled(around, resolution).with_occupancy(cells)
+    return (field.resampled(around, resolution) if field.over_texels else field).with_occupancy(cells)
 
 
 def to_frame(points: np.ndarray, space) -> np.ndarray:

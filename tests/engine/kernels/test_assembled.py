@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.decoders import density_sum, rgb, sh, sh_basis, sh_mlp, tensorf_mlp, trunk
+from fusedrf_cli.engine.decoders import density_sum, mlp, rgb, sh, sh_basis, sh_mlp, trunk
 from fusedrf_cli.engine.encodings import (
     frequencies,
     grid,
@@ -29,7 +29,8 @@ from ..conftest import BOX, points_in
 from .interpreted import assert_answers, assert_gradients, interpreted, samples
 
 RUNS = HashGrid((0.31, 0.07), 64)
-HASHED = {"levels": 4, "features": 2, "log2_rows": 6, "base": 3, "growth": 1.7}
+HASHED = {"features": 2, "levels": hash_grid.levels_of(4, 6, 3, 1.7)}
+BY_ALL = [{"scale": 5.0, "side": 5, "rows": 32, "hashed": True, "offset": 0.0}] * 3
 DENSITIES = {
     "line": (line, {"rank": 8}),
     "plane_line": (plane_line, {"rank": 8}),
@@ -38,6 +39,8 @@ DENSITIES = {
     "hash_runs": (hash_runs, {"hashed": RUNS}),
     "plane_line_hash": (plane_line_hash, {"rank": 8, "hashed": RUNS}),
     "frequencies": (frequencies, {"count": 2}),
+    "frame_frequencies": (frequencies, {"count": 3, "frame": True}),
+    "always_hashed": (hash_grid, {"features": 2, "levels": BY_ALL}),
 }
 FEATURES = DENSITIES | {"plane_line": (plane_line, {"rank": 16}), "grid": (grid, {"numbers": 13})}
 FEATURES |= {name: (trunk_features, {"outputs": count}) for name, count in (("of 16", 16), ("of 8", 8))}
@@ -47,13 +50,24 @@ SIGMAS = {
     "relu": lambda width: (density_sum, {"activation": "relu"}),
     "trunk": lambda width: (trunk, {"width": width, "hidden": 8, "outputs": 16}),
     "exp_trunk": lambda width: (trunk, {"width": width, "hidden": 8, "outputs": 8, "activation": "exp"}),
+    "limited": lambda width: (density_sum, {"activation": "exp", "limits": (-0.5, 0.5)}),
+    "deep_trunk": lambda width: (trunk, {"width": width, "hidden": 8, "outputs": 8, "layers": 4, "skip": 2}),
 }
 COLOURS = {
     "rgb": lambda width: (rgb, {"width": width}),
     "sh_basis": lambda width: (sh_basis, {"width": width, "coefficients": 4}),
     "sh": lambda width: (sh, {"width": width, "coefficients": 4 if width >= 12 else 1}),
     "sh_mlp": lambda width: (sh_mlp, {"width": width, "hidden": 8}),
-    "tensorf_mlp": lambda width: (tensorf_mlp, {"width": width, "rows": 5, "hidden": 11}),
+    "mlp": lambda width: (mlp, {"width": width, "rows": 5, "hidden": 11}),
+    "deep_mlp": lambda width: (
+        mlp, {"width": width, "rows": 0, "hidden": 8, "layers": 3, "frequencies": 3, "diffuse": True}
+    ),
+    "mlp_of_harmonics": lambda width: (
+        mlp, {"width": width, "rows": 0, "hidden": 8, "frequencies": 0, "direction": "harmonics"}
+    ),
+    "mlp_of_points": lambda width: (
+        mlp, {"width": width, "rows": 4, "hidden": 8, "layers": 1, "point": True, "limits": (-0.5, 0.5)}
+    ),
 }
 
 
@@ -65,12 +79,17 @@ class Recipe:
     colour: str
     sigma: str
     rgb: str
+    shown: str = "sigmoid"
 
 
 class Product(AssembledField):
     """A field of any encodings and decoders."""
 
     kind, shape_type = "product", Recipe
+
+    @property
+    def colour_activation(self) -> str:
+        return self.shape.shown
 
     @classmethod
     def slots_of(cls, shape: Recipe) -> dict[str, Slot]:
@@ -86,6 +105,7 @@ class Product(AssembledField):
 
 
 PRODUCTS = [Recipe(e, e, "density_sum", c) for e in ("line", "plane_line", "grid") for c in COLOURS]
+PRODUCTS += [Recipe("plane_line", "plane_line", "relu", "sh", shown) for shown in ("relu", "none", "exp")]
 PRODUCTS += [Recipe("plane_line_hash", "plane_line", "density_sum", c) for c in COLOURS]
 PRODUCTS += [
     Recipe("plane_line_hash", "grid", "exp", "sh"),
@@ -95,6 +115,9 @@ PRODUCTS += [
     Recipe("hash_grid", "of 16", "trunk", "sh_mlp"),
     Recipe("hash_grid", "hash_grid", "exp_trunk", "sh_mlp"),
     Recipe("frequencies", "of 8", "exp_trunk", "sh_mlp"),
+    Recipe("frame_frequencies", "of 8", "deep_trunk", "deep_mlp"),
+    Recipe("always_hashed", "grid", "exp_trunk", "mlp_of_points"),
+    Recipe("line", "grid", "limited", "mlp_of_harmonics"),
     Recipe("plane_line", "frequencies", "density_sum", "sh_mlp"),
 ]
 
@@ -154,10 +177,18 @@ def test_no_answer_is_beyond_the_bound(field):
     field.check_answers()
     points, dirs = (torch.from_numpy(values) for values in samples(field, 500))
     sigma, rgb = field.reference(field.params, points, dirs)
+    far = 1e5 if field.shape.density == "frame_frequencies" else 1  # no box is known to the bound
     if field.slots["sigma"].sizes["ACTIVATION"] == 0:
         raw = torch.expm1(sigma / field.scale).log() - field.shift
-        assert raw.abs().max() <= bounds["density"] < 1e4
-    assert rgb[sigma > 0].logit().abs().max() <= bounds["logit"] < 1e6
+        assert raw.abs().max() <= bounds["density"] < 1e4 * far
+    assert raw_colour(field, rgb[sigma > 0]).abs().max() <= bounds["logit"] < 1e6 * far
+
+
+def raw_colour(field, rgb):
+    """What a colour was before its activation, where that tells."""
+    if field.shape.shown == "sigmoid":
+        return rgb.logit()
+    return rgb.log() if field.shape.shown == "exp" else rgb - 0.5 * (field.shape.shown == "relu") * (rgb > 0)
 
 
 def test_what_is_prefetched_lies_in_the_numbers(field):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.decoders import tensorf_mlp
+from fusedrf_cli.engine.decoders import mlp
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import FitRun, fit
 from fusedrf_cli.engine.distillation.optimiser import Adam
@@ -160,8 +160,8 @@ def trained(field, batch) -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture
 def every_sample(monkeypatch):
     """All samples are shaded: the loss jumps where a weight crosses the threshold."""
-    sizes = tensorf_mlp.sizes
-    monkeypatch.setattr(tensorf_mlp, "sizes", lambda **options: sizes(**options) | {"LEARN_FROM": 0.0})
+    sizes = mlp.sizes
+    monkeypatch.setattr(mlp, "sizes", lambda **options: sizes(**options) | {"LEARN_FROM": 0.0})
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -319,7 +319,7 @@ class HashGrid(AssembledField):
 
     @classmethod
     def slots_of(cls, shape):
-        levels = {"levels": 4, "features": 2, "log2_rows": 6, "base": 3, "growth": 1.7}
+        levels = {"features": 2, "levels": hash_grid.levels_of(4, 6, 3, 1.7)}
         return {
             "density": Slot(hash_grid, levels, "density_"),
             "colour": Slot(trunk_features, {"outputs": 8}, "colour_"),

@@ -1,5 +1,5 @@
 """The `vm-mlp` field: planes times lines, and colour by a network on features and view (TensoRF, Chen et al.,
-ECCV 2022, with MLP_Fea shading; decoders/tensorf_mlp.py).
+ECCV 2022, with MLP_Fea shading; decoders/mlp.py).
 
 In files it is a `vm` field, whose colour basis (3, K, 3 rank), read as a matrix (3 K, 3 rank), makes the
 network's features, and the network's layers beside it.
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.decoders import density_sum, tensorf_mlp
+from fusedrf_cli.engine.decoders import density_sum, mlp
 from fusedrf_cli.engine.encodings import plane_line
 from fusedrf_cli.engine.fields.assembled import RankedShape, Slot
 from fusedrf_cli.engine.kinds.vm.field import VMConfig, VMField, box_metadata
@@ -18,6 +18,7 @@ from fusedrf_cli.engine.settings import current
 
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
 MAX_WIDTH = 256  # of a stored field
+LAYERS = 3  # of the network, the last included
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class VMMLPField(VMField):
             "density": Slot(plane_line, {"rank": shape.density_rank}, "density_"),
             "colour": Slot(plane_line, {"rank": shape.colour_rank}, "colour_"),
             "sigma": Slot(density_sum),
-            "rgb": Slot(tensorf_mlp, network, "network.", current(VMConfig).basis_rate),
+            "rgb": Slot(mlp, network, "network.", current(VMConfig).basis_rate),
         }
 
     @classmethod
@@ -111,7 +112,8 @@ class VMMLPField(VMField):
                 have = list(arrays[name].shape) if name in arrays else "nothing"
                 raise ValueError(f"array '{name}' should have shape {list(size)}, found {have}")
         own = {cls.stored_name("network.basis"): arrays[basis].reshape(shape.features, -1)}
-        for i, (inputs, outputs) in enumerate(tensorf_mlp.layer_shapes(shape.features, shape.width)):
+        layers = mlp.layer_shapes(3 * shape.colour_rank, shape.features, shape.width)
+        for i, (inputs, outputs) in enumerate(layers):
             layer = own[cls.stored_name(f"network.layer_{i}")] = np.zeros((inputs + 1, outputs), np.float32)
             weight, given = arrays[f"network.{i}.weight"], arrays[f"network.{i}.bias"]
             layer[: weight.shape[1], : len(weight)], layer[-1, : len(given)] = weight.T, given
@@ -122,7 +124,7 @@ def weight_shapes(features: int, width: int) -> dict[str, tuple[int, ...]]:
     """Names and shapes of a network's weights, (out, in), and biases, (out,)."""
     sizes = (5 * (features + 3), width, width, 3)
     shapes = {}
-    for i in range(tensorf_mlp.LAYERS):
+    for i in range(LAYERS):
         shapes[f"{i}.weight"], shapes[f"{i}.bias"] = (sizes[i + 1], sizes[i]), (sizes[i + 1],)
     return shapes
 
@@ -133,5 +135,5 @@ def untrained(features: int, width: int, generator: torch.Generator) -> dict[str
     for name, shape in weight_shapes(features, width).items():
         bound = (shape[1] if len(shape) == 2 else weights[f"{name[0]}.weight"].shape[1]) ** -0.5
         weights[name] = torch.empty(shape).uniform_(-bound, bound, generator=generator)
-    weights[f"{tensorf_mlp.LAYERS - 1}.bias"].zero_()
+    weights[f"{LAYERS - 1}.bias"].zero_()
     return weights

@@ -1,0 +1,130 @@
+"""DVGO's checkpoints (Sun et al., CVPR 2022, and its second version; github.com/sunset1995/DirectVoxGO):
+DirectVoxGO and DirectContractedVoxGO, on dense or TensoRF grids."""
+
+import numpy as np
+
+from formats.errors import FormatError
+from fusedrf_cli.bridge.importing.parts import (
+    Y0,
+    ColourInput,
+    Entries,
+    Imported,
+    ImportedNode,
+    beside,
+    colour_network,
+    eight,
+    parts_field,
+    ranks_filled,
+)
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds.assembled.field import PartsShape
+from fusedrf_cli.engine.spaces import bounded, contracted_l2, contracted_linf, space_of
+
+MODES = (("xy", "z", 0, 1, 2), ("xz", "y", 0, 2, 1), ("yz", "x", 1, 2, 0))
+
+
+def read(checkpoint) -> Imported:
+    """The field of a checkpoint. Raises FormatError."""
+    entries = Entries(checkpoint.entries)
+    kwargs, state = entries.inside("model_kwargs"), entries.inside("model_state_dict")
+    box = np.concatenate([bounds(state, kwargs, name) for name in ("xyz_min", "xyz_max")])
+    density, values, resolution, _ = grid_of(state, "density")
+    colour, more, colour_resolution, basis = grid_of(state, "k0")
+    if resolution != colour_resolution:
+        raise FormatError(f"grids of density and colour are of {resolution} and {colour_resolution} vertices")
+    values |= more
+    count = len(basis) if basis is not None else colour["numbers"]
+    rgb, shading = shading_of(kwargs, state, count, basis)
+    shape = PartsShape(density, colour, {"part": "density_sum"}, rgb)
+    space, placement = space_and_placement(kwargs, state, box)
+    base = (np.prod(box[3:] - box[:3]) / kwargs.number("num_voxels_base")) ** (1 / 3)
+    if not base > 0:
+        raise FormatError("model_kwargs: 'num_voxels_base' should be above 0")
+    cells = cells_of(state, box, space)
+    shift = state.number("act_shift")
+    field = parts_field(shape, box, resolution, values | shading, 1 / base, shift, cells)
+    return Imported([ImportedNode(field, placement)])
+
+
+def bounds(state: Entries, kwargs: Entries, name: str) -> np.ndarray:
+    """A corner (3,) of the box."""
+    return (state if name in state.values else kwargs).array(name, 3).astype(np.float64)
+
+
+def grid_of(state: Entries, which: str) -> tuple[dict, dict[str, np.ndarray], tuple, np.ndarray | None]:
+    """The entry of an encoding, its sections, texels per axis, and the matrix that makes features of those of
+    a TensoRF grid."""
+    slot = {"density": "density", "k0": "colour"}[which]
+    if f"{which}.grid" in state.values:
+        grid = state.array(f"{which}.grid", 1, None, None, None, None)[0]
+        if which == "density" and len(grid) != 1:
+            raise FormatError(f"'density.grid' should have one number at a vertex, found {len(grid)}")
+        rows = grid[0] if len(grid) == 1 else grid.transpose(1, 2, 3, 0)
+        return {"part": "grid", "numbers": len(grid)}, {f"{slot}_": rows}, grid.shape[1:], None
+    vectors = {axis: state.array(f"{which}.{axis}_vec", 1, None, None, 1)[0, :, :, 0] for axis in "xyz"}
+    resolution = tuple(vectors[axis].shape[1] for axis in "xyz")
+    ranks = [len(vectors[axis]) for _, axis, *_ in MODES]
+    rank, made = ranks_filled(ranks), {}
+    for i, (name, axis, a, b, _) in enumerate(MODES):
+        plane = state.array(f"{which}.{name}_plane", 1, ranks[i], resolution[a], resolution[b])[0]
+        filled = ((0, 0), (0, 0), (0, rank - ranks[i]))
+        made[f"{slot}_plane_{i}"] = np.pad(plane.transpose(1, 2, 0), filled)
+        made[f"{slot}_line_{i}"] = np.pad(vectors[axis].T, filled[1:])
+    basis = None
+    if which == "k0":
+        blocks = np.split(state.array("k0.f_vec", sum(ranks), None).T, np.cumsum(ranks)[:-1], 1)
+        basis = beside(blocks, rank)
+    return {"part": "plane_line", "rank": rank}, made, resolution, basis
+
+
+def shading_of(
+    kwargs: Entries, state: Entries, count: int, basis: np.ndarray | None
+) -> tuple[dict, dict[str, np.ndarray]]:
+    """The entry of the colour's decoder, and its sections; count: of features."""
+    own = {} if basis is None else {"rgb_basis": basis}
+    if not any(str(name).startswith("rgbnet.") for name in state.values):
+        if count != 3:
+            raise FormatError(f"'k0.grid' should have 3 numbers at a vertex without 'rgbnet', found {count}")
+        if basis is None:
+            return {"part": "rgb"}, {}
+        return {"part": "sh_basis", "coefficients": 1}, {"rgb_basis": basis[:, None] / Y0}
+    frequencies = kwargs.whole("viewbase_pe", 0, 16, 4)
+    layers = state.layers("rgbnet.")
+    # not all versions say whether the first three features are diffuse; the first layer's width does
+    direct = layers[0][0].shape[1] == count + 3 + 6 * frequencies
+    rows = count if basis is not None else 0
+    order = ColourInput(count, rows or eight(count), frequencies)
+    read = order.at("features")[0 if direct else 3 :]
+    columns = np.concatenate([read, order.at("direction"), order.waves("direction", frequencies)])
+    entry, sections = colour_network(layers, order, columns, rows=rows, diffuse=not direct)
+    return entry, sections | own
+
+
+def space_and_placement(kwargs: Entries, state: Entries, box: np.ndarray):
+    """The space that the grid lies in, and its frame's placement (4, 4): of contracted scenes the cube that is
+    not contracted is the frame's unit."""
+    if "scene_center" not in state.values:
+        return bounded, np.eye(4)
+    norm = kwargs.values.get("contracted_norm", "inf")
+    spaces = {"inf": contracted_linf, "l2": contracted_l2}
+    if norm not in spaces:
+        raise FormatError(f"model_kwargs: 'contracted_norm' should be inf or l2, found {str(norm)[:40]!r}")
+    shell = box[3] - 1
+    if not 0 < shell <= 1 or not np.allclose(np.abs(box), box[3]):
+        raise FormatError(f"the box of a contracted scene should be a cube up to 1 to 2, found {box.tolist()}")
+    placement = np.eye(4)
+    placement[:3, :3] = np.diag(np.broadcast_to(state.array("scene_radius").astype(np.float64), 3))
+    placement[:3, 3] = state.array("scene_center", 3)
+    return space_of(spaces[norm], shell=float(shell), contracted_density=1.0), placement
+
+
+def cells_of(state: Entries, box: np.ndarray, space) -> OccupancyGrid:
+    """The mask cache, whose samples each stand for a cell around them."""
+    if "mask_cache.mask" not in state.values:
+        return OccupancyGrid.full(box, space=space)
+    mask = state.array("mask_cache.mask", None, None, None) > 0
+    scale, shift = (state.array(f"mask_cache.xyz2ijk_{name}", 3).astype(np.float64) for name in ("scale", "shift"))
+    if not (scale > 0).all():
+        raise FormatError("'mask_cache.xyz2ijk_scale' should be above 0")
+    faces = [(-0.5 - shift) / scale, (np.array(mask.shape) - 0.5 - shift) / scale]
+    return OccupancyGrid(np.concatenate(faces), mask, space)
