@@ -1,7 +1,8 @@
 """Which system wrote a checkpoint, told by what the file holds, and what its run says beside it."""
 
+import fnmatch
 import re
-from collections.abc import Callable
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -54,7 +55,8 @@ class System(NamedTuple):
     """How the checkpoints of a system are told, and what its runs leave beside them."""
 
     title: str
-    holds: Callable[[dict], bool]
+    rule: str
+    """Of the names in its files, as `_fits` reads it."""
     beside: tuple[str, ...] = ()
 
 
@@ -68,7 +70,8 @@ def open_checkpoint(path: Path | str) -> Checkpoint:
     if path.is_dir():
         return _of_folder(path)
     entries = _entries(path)
-    system = next((name for name, system in SYSTEMS.items() if system.holds(entries)), None)
+    names = _names(entries)
+    system = next((name for name, system in SYSTEMS.items() if _fits(system.rule, names)), None)
     if system is None:
         raise UnknownCheckpoint(
             f"{path}: {_described(entries)}, which no known system writes; {known_systems()}"
@@ -104,7 +107,7 @@ def _entries(path: Path) -> dict:
             return _table(read_torch(path))
         if array_names(archive):
             return read_npz(path)
-    if head.startswith(GZIP) or _begins_as_map(head):
+    if _begins_as_map(_unzipped(head) if head.startswith(GZIP) else head):
         entries = read_msgpack(path)
         if isinstance(entries, dict):
             return entries
@@ -114,6 +117,14 @@ def _entries(path: Path) -> dict:
 def _table(value: object) -> dict:
     """A torch file's dictionary; anything else under the name of its type."""
     return value if isinstance(value, dict) else {type(value).__name__: value}
+
+
+def _unzipped(head: bytes) -> bytes:
+    """The first bytes in a gzip stream; none where it is damaged."""
+    try:
+        return zlib.decompressobj(31).decompress(head, 64)
+    except zlib.error:
+        return b""
 
 
 def _begins_as_map(head: bytes) -> bool:
@@ -174,114 +185,62 @@ def _check_snapshot(snapshot: dict, path: Path) -> None:
 # --- systems ------------------------------------------------------------------------------------------------
 
 
-def _part(entries: dict, *names: str) -> dict:
-    """The dictionary at a path of keys; empty where there is none."""
-    for name in names:
-        entries = entries.get(name) if isinstance(entries, dict) else None
-    return entries if isinstance(entries, dict) else {}
+def _names(entries: dict, levels: int = 4) -> list[str]:
+    """Paths "a/b/c" of the dictionaries, tensors and binaries in the first levels, tensors as "a/b:2x3"."""
+    names = []
+    for key, value in entries.items():
+        if "/" in str(key) or not isinstance(value, dict | StoredTensor | bytes):
+            continue
+        size = "x".join(map(str, value.shape)) if isinstance(value, StoredTensor) else ""
+        names.append(f"{key}:{size}")
+        if isinstance(value, dict) and levels > 1:
+            names += [f"{key}/{name}" for name in _names(value, levels - 1)]
+    return names
 
 
-def _has(*names: str, within: tuple[str, ...] = (), but: tuple[str, ...] = ()) -> Callable[[dict], bool]:
-    """Whether a dictionary of a checkpoint has all these tensors and dictionaries, and none of those."""
-
-    def holds(entries: dict) -> bool:
-        part = _part(entries, *within)
-        return all(isinstance(part.get(n), StoredTensor | dict | bytes) for n in names) and not any(
-            n in part for n in but
-        )
-
-    return holds
+def _fits(rule: str, names: list[str]) -> bool:
+    """Whether names fit a rule: alternatives, with "|" between them, of patterns that all have to fit."""
+    return any(
+        all(bool(fnmatch.filter(names, word.lstrip("!"))) != word.startswith("!") for word in words.split())
+        for words in rule.split("|")
+    )
 
 
-def _any(*rules: Callable[[dict], bool]) -> Callable[[dict], bool]:
-    return lambda entries: any(rule(entries) for rule in rules)
-
-
-def _all(*rules: Callable[[dict], bool]) -> Callable[[dict], bool]:
-    return lambda entries: all(rule(entries) for rule in rules)
-
-
-def _sized(name: str, axis: int, size: int, within: tuple[str, ...]) -> Callable[[dict], bool]:
-    """Whether a tensor has a size along an axis."""
-
-    def holds(entries: dict) -> bool:
-        tensor = _part(entries, *within).get(name)
-        return isinstance(tensor, StoredTensor) and tensor.shape[axis : axis + 1] == (size,)
-
-    return holds
-
-
-_DVGO = ("model_state_dict",)
-_MPI = _any(_sized("act_shift", 3, 1, _DVGO), _has("act_shift.grid", within=_DVGO))
-_GRID = _any(
-    *(_has(f"density.{name}", f"k0.{name}", within=_DVGO) for name in ("grid", "xy_plane")),
-    _has("density.grid", "k0.xy_plane", within=_DVGO),
-)
-_MODEL = ("model",)
-_HASH = _has(
-    "encoder.embeddings", "encoder.offsets", "sigma_net.0.weight", "color_net.0.weight", within=_MODEL
-)
-_PVD_OFFSETS = _sized("encoder.offsets", 0, 15, _MODEL)
-"""PVD's hash grid has 14 levels, where torch-ngp's has 16."""
-_FIELD = "_model.field."
-_FLAX = ("optimizer", "target", "model")
-
-SYSTEMS = {  # the first that fits counts
-    "tensorf": System(
-        "TensoRF", _all(_has("kwargs"), _has("density_line.0", "app_line.0", within=("state_dict",)))
+_GRIDS = "model_state_dict:* model_state_dict/density.*:* model_state_dict/k0.*:*"
+SYSTEMS = {  # the first whose rule fits counts
+    "tensorf": System("TensoRF", "kwargs:* state_dict/density_line.0:* state_dict/app_line.0:*"),
+    "svox2": System("Plenoxels (svox2)", "links:* density_data:* sh_data:* | links:* data:*", ("args.json",)),
+    "dcvgo": System("DVGO (unbounded)", f"model_state_dict/scene_radius:* {_GRIDS}", ("config.py",)),
+    "dmpigo": System(
+        "DVGO (NDC)",
+        f"model_state_dict/act_shift.grid:* {_GRIDS} | model_state_dict/act_shift:1x1x1x1x* {_GRIDS}",
+        ("config.py",),
     ),
-    "svox2": System(
-        "Plenoxels (svox2)",
-        _any(_has("links", "density_data", "sh_data"), _has("links", "data", but=("density_data",))),
-        ("args.json",),
-    ),
-    "dcvgo": System(
-        "DVGO (unbounded)", _all(_has("scene_center", "scene_radius", within=_DVGO), _GRID), ("config.py",)
-    ),
-    "dmpigo": System("DVGO (NDC)", _all(_has("model_kwargs"), _GRID, _MPI), ("config.py",)),
-    "dvgo": System("DVGO", _all(_has("model_kwargs"), _GRID), ("config.py",)),
-    "instant-ngp": System("instant-ngp", _has("params_binary", within=("snapshot",))),
-    "hashnerf": System("HashNeRF", _has("network_fn_state_dict", "embed_fn_state_dict"), ("args.txt",)),
-    "nerf-pytorch": System(
-        "nerf-pytorch", _has("pts_linears.0.weight", within=("network_fn_state_dict",)), ("args.txt",)
-    ),
+    "dvgo": System("DVGO", f"model_kwargs:* {_GRIDS}", ("config.py",)),
+    "instant-ngp": System("instant-ngp", "snapshot/params_binary:*"),
+    "hashnerf": System("HashNeRF", "network_fn_state_dict:* embed_fn_state_dict:*", ("args.txt",)),
+    "nerf-pytorch": System("nerf-pytorch", "network_fn_state_dict/pts_linears.0.weight:*", ("args.txt",)),
     "krrish-nerf": System(
-        "krrish94's nerf-pytorch", _has("layer1.weight", within=("model_coarse_state_dict",)), ("config.yml",)
+        "krrish94's nerf-pytorch", "model_coarse_state_dict/layer1.weight:*", ("config.yml",)
     ),
-    "pvd": System(
+    "pvd": System(  # its hash grid has 14 levels, where torch-ngp's has 16
         "PVD",
-        _any(
-            _all(_HASH, _PVD_OFFSETS),
-            _has("nerf_mlp.0.weight", "sigma_net.0.weight", within=_MODEL),
-            _all(
-                _has("sigma_mat.0", "color_mat.0", within=_MODEL), _sized("basis_mat.weight", 0, 15, _MODEL)
-            ),
-            _has("tensor_volume.0", within=_MODEL),
-        ),
+        "model/encoder.embeddings:* model/encoder.offsets:15 model/sigma_net.0.weight:* !model/deform_net.*"
+        "| model/nerf_mlp.0.weight:* model/sigma_net.0.weight:* | model/tensor_volume.0:*"
+        "| model/sigma_mat.0:* model/color_mat.0:* model/basis_mat.weight:15x*",
     ),
-    "torch-ngp": System("torch-ngp", _HASH),
+    "torch-ngp": System(  # but for its networks of moving scenes
+        "torch-ngp",
+        "model/encoder.embeddings:* model/encoder.offsets:* model/sigma_net.0.weight:* "
+        "!model/deform_net.* !model/basis_net.* !model/ambient_net.*",
+    ),
     "nerfacto": System(
         "nerfstudio's nerfacto",
-        _all(
-            _any(
-                *(
-                    _has(_FIELD + n, within=("pipeline",))
-                    for n in ("mlp_base.model.params", "mlp_base.model.0.hash_table")
-                )
-            ),
-            _any(
-                *(
-                    _has(_FIELD + n, within=("pipeline",))
-                    for n in ("mlp_head.tcnn_encoding.params", "mlp_head.layers.0.weight")
-                )
-            ),
-        ),
+        "pipeline/_model.field.mlp_base* pipeline/_model.field.mlp_head* pipeline/_model.proposal_networks.*",
         ("config.yml", "dataparser_transforms.json"),
     ),
-    "k-planes": System(
-        "K-Planes", _has("field.grids.0.0", "field.sigma_net.params", within=_MODEL), ("config.py",)
-    ),
-    "d2nerf": System("D²NeRF", _has("static_nerf", within=_FLAX), ("options.json", "config.gin")),
+    "k-planes": System("K-Planes", "model/field.grids.0.0:* model/field.sigma_net.params:*", ("config.py",)),
+    "d2nerf": System("D²NeRF", "optimizer/target/model/static_nerf:*", ("options.json", "config.gin")),
 }
 
 
@@ -301,8 +260,10 @@ def _of_folder(folder: Path) -> Checkpoint:
         except UnknownCheckpoint:
             continue
     if not found:
-        names = f"such as {files[0].name}, which is none" if files else "by their names"
-        raise UnknownCheckpoint(f"{folder}: holds no checkpoint of a known system {names}; {known_systems()}")
+        names = f"{files[0].name} is none" if files else f"no file named {', '.join(ENDINGS)}"
+        raise UnknownCheckpoint(
+            f"{folder}: holds no checkpoint of a known system ({names}); {known_systems()}"
+        )
     if len(found) > 1:
         names = listed(checkpoint.path.name for checkpoint in found)
         raise UnknownCheckpoint(
