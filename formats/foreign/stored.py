@@ -76,7 +76,9 @@ class StoredTensor:
         view = np.lib.stride_tricks.as_strided(flat[offset:], self.shape, steps)
         array = np.require(view, stored, ["C", "W"])
         if self.dtype == "bfloat16":
-            return (array.astype(np.uint32) << 16).view(np.float32)
+            wide = array.astype(np.uint32)
+            wide <<= 16
+            return wide.view(np.float32)
         return array
 
     def __repr__(self) -> str:

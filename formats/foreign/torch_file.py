@@ -287,8 +287,8 @@ def _scalar(arguments: tuple) -> np.generic:
 
 
 def _encoded(arguments: tuple) -> bytes:
-    """_codecs.encode(text, "latin1"), which is how protocol 2 writes bytes."""
-    text, codec = arguments
+    """_codecs.encode(text, "latin1") or bytes(), which is how protocol 2 writes bytes."""
+    text, codec = arguments or ("", "latin1")
     if not isinstance(text, str) or codec not in ("latin1", "latin-1"):
         raise BadCheckpoint(f"a text is encoded in an unusual way; {AGAIN}")
     return text.encode("latin-1")
@@ -311,6 +311,7 @@ KNOWN: dict[str, Global] = {
     "numpy dtype": _dtype,
     "numpy ndarray": _no_value,
     "_codecs encode": _encoded,
+    "__builtin__ bytes": _encoded,
     **{f"numpy.{core}.multiarray _reconstruct": lambda _: _Array() for core in ("core", "_core")},
     **{f"numpy.{core}.multiarray scalar": _scalar for core in ("core", "_core")},
     **dict.fromkeys(STORAGE_TYPES, _no_value),

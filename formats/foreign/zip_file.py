@@ -61,9 +61,10 @@ class Archive:
                 )
             deflated = entry.compress_type == zipfile.ZIP_DEFLATED
             packed = entry.compress_size
-            if not 0 <= entry.header_offset <= size - LOCAL.size - packed:
-                raise BadCheckpoint(f"{path}: member {name} reaches past the end of the file; copy it again")
-            if entry.file_size > (max(FREE, MAX_RATIO * packed) if deflated else packed):
+            reaches = not 0 <= entry.header_offset <= size - LOCAL.size - packed
+            if reaches or not deflated and packed != entry.file_size:
+                raise BadCheckpoint(f"{path}: member {name} does not fit the file; copy it again")
+            if deflated and entry.file_size > max(FREE, MAX_RATIO * packed):
                 raise LimitExceeded(
                     f"{path}: member {name} has {packed:,} bytes and says that it unpacks to "
                     f"{entry.file_size:,}, which is more than is believed"
@@ -109,7 +110,7 @@ class Archive:
             unpacked = unpacker.decompress(data, member.size + 1)
         except zlib.error as error:
             raise BadCheckpoint(f"{self.path}: member {name} is damaged ({error}); copy it again") from error
-        if len(unpacked) != member.size or not unpacker.eof:
+        if len(unpacked) != member.size or not unpacker.eof or unpacker.unused_data:
             raise BadCheckpoint(f"{self.path}: member {name} does not unpack to its {member.size:,} bytes")
         return unpacked
 
