@@ -17,15 +17,15 @@ MAX_RATIO = 100
 """How often larger than its bytes a gzip stream may become, beyond FREE bytes."""
 FREE = 256 << 20
 PIECE = 1 << 20
-MAX_LENGTH = 1 << 16
-"""Of a list, which is allocated before its items are read."""
+MAX_LENGTH = 1 << 14
+"""Of a list or map, which is allocated before its items are read."""
 MAX_VALUES = 500_000
 ARRAY, SCALAR = 1, 3
 """Kinds of flax's extension: [shape, type, bytes] of an array and of a single number."""
 
 
-def read_msgpack(path: Path | str) -> object:
-    """What a MessagePack file holds, gzip undone: binaries are bytes, flax's arrays StoredTensors and its
+def read_msgpack(path: Path | str) -> dict:
+    """The map of a MessagePack file, gzip undone: binaries are bytes, flax's arrays StoredTensors and its
     scalars numpy's; an object {"bytes": [0 to 255, …]}, as which converters to JSON write them, is bytes too.
 
     Raises BadCheckpoint, LimitExceeded, MissingFile, NotAFile, ResourceError.
@@ -55,6 +55,8 @@ def read_msgpack(path: Path | str) -> object:
         OverflowError,
     ) as error:
         raise BadCheckpoint(f"{path}: its MessagePack is damaged ({error}); copy it again") from error
+    if not isinstance(value, dict):
+        raise BadCheckpoint(f"{path}: its MessagePack holds a {type(value).__name__}, expected a map")
     check_plain(value, str(path))
     return value
 

@@ -9,6 +9,8 @@ from formats.errors import BadCheckpoint, LimitExceeded
 
 DTYPES = ("float16", "float32", "float64", "bfloat16", "bool", *(f"int{n}" for n in (8, 16, 32, 64)))
 DTYPES += tuple(f"uint{n}" for n in (8, 16, 32, 64))
+CODES = {np.dtype(name).str[1:]: name for name in DTYPES if name != "bfloat16"}
+"""Names of types by numpy's codes, such as "f4"."""
 MAX_DIMENSIONS = 16
 MAX_REPEATED = 1 << 16
 """Elements of a tensor that shows stored numbers several times."""

@@ -108,9 +108,7 @@ def _entries(path: Path) -> dict:
         if array_names(archive):
             return read_npz(path)
     if _begins_as_map(_unzipped(head) if head.startswith(GZIP) else head):
-        entries = read_msgpack(path)
-        if isinstance(entries, dict):
-            return entries
+        return read_msgpack(path)
     raise _other_file(path, head)
 
 

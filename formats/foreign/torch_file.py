@@ -16,7 +16,7 @@ import numpy as np
 
 from formats.errors import BadCheckpoint, FormatError
 from formats.foreign.pickles import Global, Named, Pending, read_pickle, set_item
-from formats.foreign.stored import DTYPES, StoredTensor, c_strides, check_plain, shape_of
+from formats.foreign.stored import CODES, StoredTensor, c_strides, check_plain, shape_of
 from formats.foreign.zip_file import Archive
 from formats.safe_input import open_input
 
@@ -251,9 +251,6 @@ def _dtype(arguments: tuple) -> _DType:
             f"holds a numpy array of type {shown!r}, and only numbers are read (objects would need code)"
         )
     return _DType(code)
-
-
-CODES = {np.dtype(name).str[1:]: name for name in DTYPES if name != "bfloat16"}
 
 
 class _Array(StoredTensor, Pending):

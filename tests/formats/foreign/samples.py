@@ -11,6 +11,8 @@ import msgpack
 import numpy as np
 import torch
 
+from formats.foreign.stored import StoredTensor
+from formats.foreign.systems import open_checkpoint
 from tests.promises.mutations import DAMAGES, EDGES
 
 BLIND = sorted(DAMAGES.keys() - {"edge"})
@@ -144,6 +146,17 @@ BESIDE = {
 }
 
 
+def old_torch(folder: Path) -> Path:
+    """A checkpoint of before torch 1.6."""
+    torch.save(TORCH["krrish-nerf"][1], folder / "a.ckpt", _use_new_zipfile_serialization=False)
+    return folder / "a.ckpt"
+
+
+def compressed_npz(folder: Path) -> Path:
+    svox2(folder / "a.npz", np.savez_compressed)
+    return folder / "a.npz"
+
+
 def svox2(path: Path, save: Callable = np.savez) -> None:
     rows = np.arange(8, dtype=np.int32).reshape(2, 2, 2)
     numbers = {"density_data": np.ones((8, 1), np.float32), "sh_data": np.ones((8, 3), np.float16)}
@@ -173,6 +186,17 @@ def write(system: str, folder: Path) -> Path:
 
 
 SYSTEMS = (*TORCH, "svox2", "instant-ngp", "d2nerf")
+
+
+def read_all(path: Path) -> None:
+    """Open a checkpoint and read every number of it."""
+    level = [open_checkpoint(path).entries]
+    while level:
+        level = [inner for value in level for inner in (value.values() if isinstance(value, dict) else value)]
+        for tensor in level:
+            if isinstance(tensor, StoredTensor):
+                assert tensor.array().shape == tensor.shape
+        level = [value for value in level if isinstance(value, dict | list | tuple)]
 
 
 # --- hostile files ------------------------------------------------------------------------------------------
