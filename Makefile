@@ -10,6 +10,7 @@ VENV := $(filter .venv/bin/python,$(PYTHON))
 # writer at random moments.
 PACKS ?= 10000
 RUNS ?= 1000
+FOREIGN ?= 2000
 KILLS ?= 200
 SEED ?= 0
 
@@ -41,10 +42,10 @@ test-order: $(VENV)  ## the quick tests in random order, which is said and can b
 test-slow: $(VENV)  ## the slow tests, two files at a time, and how long each takes; SLOW=--third: a third of them
 	$(PYTHON) -m tests.slow $(SLOW)
 
-fuzz: $(VENV)  ## 10,000 hostile packs, captures and meshes, 1,000 by whole commands, and 200 kills of every command; PACKS=, RUNS=, KILLS=, SEED=
+fuzz: $(VENV)  ## 10,000 hostile packs, captures and meshes, 1,000 by whole commands, 2,000 checkpoints of every other system, and 200 kills of every command; PACKS=, RUNS=, FOREIGN=, KILLS=, SEED=
 	$(PYTHON) -m tests.promises.fuzz --count $(PACKS) --seed $(SEED)
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PYTHON) -m tests.promises.commands --count $(RUNS) --seed $(SEED)
-	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PYTHON) -m tests.promises.fuzz_inputs --readers $(PACKS) --commands $(RUNS) --seed $(SEED)
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PYTHON) -m tests.promises.fuzz_inputs --readers $(PACKS) --foreign $(FOREIGN) --commands $(RUNS) --seed $(SEED)
 	$(PYTHON) -m tests.promises.kills --kills $(KILLS) --seed $(SEED) --calls --adds 16
 
 docs: $(VENV)  ## docs/commands.md, out of --help

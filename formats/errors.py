@@ -146,6 +146,21 @@ class NotFinite(FormatError):
     """NaN or infinity among numbers, or a number too large for the precision it is stored in."""
 
 
+# --- checkpoints of other systems ---------------------------------------------------------------------------
+
+
+class BadCheckpoint(FormatError):
+    """A checkpoint of another system that is damaged, or does not follow its format."""
+
+
+class UnknownCheckpoint(FormatError):
+    """What was given to import is no checkpoint of a system that is known."""
+
+
+class NeedsCode(FormatError):
+    """A checkpoint that could only be loaded by running code of its author's."""
+
+
 # --- scenes -------------------------------------------------------------------------------------------------
 
 

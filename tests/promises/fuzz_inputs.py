@@ -1,7 +1,8 @@
 """Damaged captures, meshes, scenes and checkpoints: `python -m tests.promises.fuzz_inputs --seed 0`.
 
-`--readers N` mutates N inputs and has the readers read them in this process. `--commands N` has whole
-commands work on N of them, each in a child (commands.py). An input is wrong if it ended in anything but an
+`--readers N` mutates N inputs and has the readers read them in this process, `--foreign N` as many of each
+format of other systems' checkpoints. `--commands N` has whole commands work on N of them, each in a child
+(commands.py). An input is wrong if it ended in anything but an
 error of the program's own, took too long or too much memory, did not end when it was asked to, or left a
 temporary. Every input follows from (seed, index).
 """
@@ -10,6 +11,7 @@ import argparse
 import json
 import os
 import random
+import resource
 import shutil
 import signal
 import sys
@@ -17,7 +19,9 @@ import tempfile
 import traceback
 import warnings
 from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +35,7 @@ from formats.photos import load_photos
 from fusedrf_cli.errors import FusedRFError
 from fusedrf_cli.main import cli
 from tests.bridge.conftest import stock_fields
+from tests.formats.foreign import samples
 from tests.promises.checkpoints import NAME, RUNS, checkpoint, intact, interrupted, spoilt_checkpoint
 from tests.promises.commands import PATIENCE, QUICK, judged, run
 from tests.promises.fuzz import Hung
@@ -39,6 +44,8 @@ from tests.promises.inputs import CAPTURES, MESHES
 from tests.promises.kills import forked
 from tests.promises.mutations import DAMAGES, EDGES, TOKENS, spoilt_json
 
+MAX_MB = 500
+"""Of memory that reading one small input may take."""
 EARLY = 0.2
 """Share of the commands that are asked to end after a moment."""
 TEXTS = (".json", ".gltf", ".obj", ".mtl", ".txt")
@@ -146,8 +153,34 @@ def readers(count: int, seed: int, folder: Path) -> dict:
     return {"inputs": count, "wrong": wrong, "counts": dict(sorted(found.items()))}
 
 
-def reading(source: Path) -> tuple[str, str | None]:
+def foreign(count: int, seed: int, folder: Path) -> dict:
+    """`count` mutations of a checkpoint of every system, and of its settings, through the readers; what went
+    wrong."""
+    found, wrong = Counter(), []
+    makers = {name: partial(samples.write, name) for name in samples.SYSTEMS}
+    makers |= {make.__name__: make for make in (samples.old_torch, samples.compressed_npz)}
+    for name, make in makers.items():
+        home = folder / name
+        home.mkdir()
+        path = make(home)
+        whole = {file: file.read_bytes() for file in home.rglob("*") if file.is_file()}
+        for index in range(count):
+            rng = random.Random(f"foreign/{seed}/{name}/{index}")
+            file = path if rng.random() < 0.8 else rng.choice(sorted(whole))
+            file.write_bytes(samples.spoilt(whole[file], rng))
+            if file.suffix in (*TEXTS, ".yml", ".py") and rng.random() < 0.7:
+                file.write_bytes(spoilt_words(whole[file], rng))
+            outcome, problem = reading(path, samples.read_all)
+            found[f"{name}: {outcome}"] += 1
+            if problem:
+                wrong.append({"index": index, "kind": name, "done": file.name, "problem": problem})
+            file.write_bytes(whole[file])
+    return {"inputs": found.total(), "wrong": wrong, "counts": dict(sorted(found.items()))}
+
+
+def reading(source: Path, read: Callable[[Path], None] = read) -> tuple[str, str | None]:
     """How reading ended, and what is wrong with that."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
         with patiently():
             read(source)
@@ -157,7 +190,8 @@ def reading(source: Path) -> tuple[str, str | None]:
         return "hung", "hung"
     except Exception:
         return "crashed", traceback.format_exc()
-    return "read", None
+    taken = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) >> 10
+    return "read", None if taken < MAX_MB else f"took {taken} MB"
 
 
 def laid_out(folder: Path) -> dict[str, Path]:
@@ -257,11 +291,16 @@ def line(folder: Path, sound: dict[str, Path], rng: random.Random) -> tuple[tupl
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--readers", type=int, default=10_000)
+    parser.add_argument("--foreign", type=int, default=2_000)
     parser.add_argument("--commands", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     found = {}
-    for tried, count in ((readers, options.readers), (commands, options.commands)):
+    for tried, count in (
+        (readers, options.readers),
+        (foreign, options.foreign),
+        (commands, options.commands),
+    ):
         if count:
             with tempfile.TemporaryDirectory() as folder:
                 found[tried.__name__] = tried(count, options.seed, Path(folder))

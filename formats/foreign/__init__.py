@@ -1,0 +1,1 @@
+"""Checkpoint files of other systems, read to plain containers of numbers without running code."""

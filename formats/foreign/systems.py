@@ -1,0 +1,290 @@
+"""Which system wrote a checkpoint, told by what the file holds, and what its run says beside it."""
+
+import fnmatch
+import re
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from formats.errors import (
+    FormatError,
+    NewerVersion,
+    OlderVersion,
+    UnknownCheckpoint,
+    counted,
+    listed,
+    noted,
+)
+from formats.foreign.beside import read_beside
+from formats.foreign.msgpack_file import GZIP, read_msgpack
+from formats.foreign.npz_file import array_names, read_npz
+from formats.foreign.stored import StoredTensor
+from formats.foreign.torch_file import OLD_MAGIC, pickle_member, read_torch
+from formats.foreign.zip_file import MAGIC as ZIP
+from formats.foreign.zip_file import Archive
+from formats.other_files import HEAD, identify
+from formats.safe_input import open_input
+
+NGP_VERSION = 1
+ENDINGS = (".th", ".tar", ".pth", ".pt", ".ckpt", ".npz", ".ingp", ".msgpack")
+"""Of files of a folder that may be a run's checkpoints, beside those named `checkpoint_N`."""
+FOLDERS = ("nerfstudio_models", "checkpoints")
+"""Folders of a run that hold its checkpoints."""
+MAX_FILES = 2000
+MAX_TRIED = 50
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint of another system.
+
+    `system` is a name of SYSTEMS, `entries` what the file holds: plain containers, with a StoredTensor for
+    every array. `beside` has, by their names, the files of settings that lie beside it and could be read.
+    `notes` are sentences for the report.
+    """
+
+    system: str
+    entries: dict
+    path: Path
+    beside: dict[str, object] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+class System(NamedTuple):
+    """How the checkpoints of a system are told, and what its runs leave beside them."""
+
+    title: str
+    rule: str
+    """Of the names in its files, as `_fits` reads it."""
+    beside: tuple[str, ...] = ()
+
+
+def open_checkpoint(path: Path | str) -> Checkpoint:
+    """A checkpoint, or the newest one of a run's folder; only what it needs is read.
+
+    Raises UnknownCheckpoint for any other file or folder, BadCheckpoint, NeedsCode, ChecksumMismatch,
+    LimitExceeded, NewerVersion, OlderVersion, MissingFile, NotAFile, ResourceError.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _of_folder(path)
+    entries = _entries(path)
+    names = _names(entries)
+    system = next((name for name, system in SYSTEMS.items() if _fits(system.rule, names)), None)
+    if system is None:
+        raise UnknownCheckpoint(
+            f"{path}: {_described(entries)}, which no known system writes; {known_systems()}"
+        )
+    if system == "instant-ngp":
+        _check_snapshot(entries["snapshot"], path)
+    found = Checkpoint(system, entries, path)
+    for name in SYSTEMS[system].beside:
+        for folder in (path.parent, path.parent.parent)[: 2 if path.parent.name in FOLDERS else 1]:
+            if (folder / name).is_file() and name not in found.beside:
+                with noted(found.notes, "it is not used"):
+                    found.beside[name] = read_beside(folder / name)
+    return found
+
+
+def known_systems() -> str:
+    """ "known are TensoRF, …"."""
+    return f"known are {', '.join(system.title for system in SYSTEMS.values())}"
+
+
+# --- files --------------------------------------------------------------------------------------------------
+
+
+def _entries(path: Path) -> dict:
+    """What a file holds, by the format that its first bytes tell."""
+    with open_input(path) as file:
+        head = file.read(HEAD)
+    if head.startswith(OLD_MAGIC):
+        return _table(read_torch(path))
+    if head.startswith(ZIP) and identify(head, path.suffix).kind != "bundle":
+        archive = Archive(path)
+        if pickle_member(archive):
+            return _table(read_torch(path))
+        if array_names(archive):
+            return read_npz(path)
+    if _begins_as_map(_unzipped(head) if head.startswith(GZIP) else head):
+        return read_msgpack(path)
+    raise _other_file(path, head)
+
+
+def _table(value: object) -> dict:
+    """A torch file's dictionary; anything else under the name of its type."""
+    return value if isinstance(value, dict) else {type(value).__name__: value}
+
+
+def _unzipped(head: bytes) -> bytes:
+    """The first bytes in a gzip stream; none where it is damaged."""
+    try:
+        return zlib.decompressobj(31).decompress(head, 64)
+    except zlib.error:
+        return b""
+
+
+def _begins_as_map(head: bytes) -> bool:
+    """Whether bytes begin as a map of MessagePack does whose first key is a short text."""
+    if head[:1] and 0x81 <= head[0] <= 0x8F:
+        key = head[1:2]
+    elif head[:1] in (b"\xde", b"\xdf"):
+        key = head[3:4] if head[0] == 0xDE else head[5:6]
+    else:
+        return False
+    return bool(key) and (0xA1 <= key[0] <= 0xBF or key[0] == 0xD9)
+
+
+def _other_file(path: Path, head: bytes) -> FormatError:
+    """The error for a file that is no checkpoint."""
+    other = identify(head, path.suffix)
+    if other is None or other.kind in ("checkpoint", "archive", "text", "other"):
+        return UnknownCheckpoint(f"{path}: begins as no checkpoint of a known system does; {known_systems()}")
+    return UnknownCheckpoint(
+        f"{path}: is {other.what}, no checkpoint; {CURES.get(other.kind, known_systems())}"
+    )
+
+
+CURES = {
+    "bundle": "it needs no import: render it, or place it in a scene with `fusedrf compose`",
+    "photo": "give a folder of photos to `fusedrf train`",
+    "mesh": "give it to `fusedrf train`, which learns a field of it",
+    "empty": "copy or export it again",
+}
+
+
+def _described(entries: dict) -> str:
+    """What an unknown file holds: its first keys, and those of the first dictionary in it."""
+    if not entries:
+        return "is empty"
+    inner = next(((k, v) for k, v in entries.items() if isinstance(v, dict) and v), None)
+    more = f" ({inner[0]}: {listed(inner[1], 6)})" if inner else ""
+    return f"holds {listed(entries, 8)}{more}"
+
+
+def _check_snapshot(snapshot: dict, path: Path) -> None:
+    """Raise for a snapshot of instant-ngp that is no radiance field, or of a version that is not known."""
+    if (mode := snapshot.get("mode", "nerf")) not in ("nerf", 0):
+        raise UnknownCheckpoint(f"{path}: holds instant-ngp's mode {str(mode)[:40]!r}, expected nerf")
+    version = snapshot.get("version")
+    if type(version) is not int:
+        raise OlderVersion(
+            f"{path}: a snapshot of instant-ngp from before July 2022, without a version; train it again "
+            "with a newer instant-ngp"
+        )
+    if version > NGP_VERSION:
+        raise NewerVersion(
+            f"{path}: a snapshot of instant-ngp of version {version}, and this fusedrf reads {NGP_VERSION}; "
+            "take a newer fusedrf"
+        )
+
+
+# --- systems ------------------------------------------------------------------------------------------------
+
+
+def _names(entries: dict, levels: int = 4) -> list[str]:
+    """Paths "a/b/c" of the dictionaries, tensors and binaries in the first levels, tensors as "a/b:2x3"."""
+    names = []
+    for key, value in entries.items():
+        if "/" in str(key) or not isinstance(value, dict | StoredTensor | bytes):
+            continue
+        size = "x".join(map(str, value.shape)) if isinstance(value, StoredTensor) else ""
+        names.append(f"{key}:{size}")
+        if isinstance(value, dict) and levels > 1:
+            names += [f"{key}/{name}" for name in _names(value, levels - 1)]
+    return names
+
+
+def _fits(rule: str, names: list[str]) -> bool:
+    """Whether names fit a rule: alternatives, with "|" between them, of patterns that all have to fit."""
+    return any(
+        all(bool(fnmatch.filter(names, word.lstrip("!"))) != word.startswith("!") for word in words.split())
+        for words in rule.split("|")
+    )
+
+
+_GRIDS = "model_state_dict:* model_state_dict/density.*:* model_state_dict/k0.*:*"
+SYSTEMS = {  # the first whose rule fits counts
+    "tensorf": System("TensoRF", "kwargs:* state_dict/density_line.0:* state_dict/app_line.0:*"),
+    "svox2": System("Plenoxels (svox2)", "links:* density_data:* sh_data:* | links:* data:*", ("args.json",)),
+    "dcvgo": System("DVGO (unbounded)", f"model_state_dict/scene_radius:* {_GRIDS}", ("config.py",)),
+    "dmpigo": System(
+        "DVGO (NDC)",
+        f"model_state_dict/act_shift.grid:* {_GRIDS} | model_state_dict/act_shift:1x1x1x1x* {_GRIDS}",
+        ("config.py",),
+    ),
+    "dvgo": System("DVGO", f"model_kwargs:* {_GRIDS}", ("config.py",)),
+    "instant-ngp": System("instant-ngp", "snapshot/params_binary:*"),
+    "hashnerf": System("HashNeRF", "network_fn_state_dict:* embed_fn_state_dict:*", ("args.txt",)),
+    "nerf-pytorch": System("nerf-pytorch", "network_fn_state_dict/pts_linears.0.weight:*", ("args.txt",)),
+    "krrish-nerf": System(
+        "krrish94's nerf-pytorch", "model_coarse_state_dict/layer1.weight:*", ("config.yml",)
+    ),
+    "pvd": System(  # its hash grid has 14 levels, where torch-ngp's has 16
+        "PVD",
+        "model/encoder.embeddings:* model/encoder.offsets:15 model/sigma_net.0.weight:* !model/deform_net.*"
+        "| model/nerf_mlp.0.weight:* model/sigma_net.0.weight:* | model/tensor_volume.0:*"
+        "| model/sigma_mat.0:* model/color_mat.0:* model/basis_mat.weight:15x*",
+    ),
+    "torch-ngp": System(  # but for its networks of moving scenes
+        "torch-ngp",
+        "model/encoder.embeddings:* model/encoder.offsets:* model/sigma_net.0.weight:* "
+        "!model/deform_net.* !model/basis_net.* !model/ambient_net.*",
+    ),
+    "nerfacto": System(
+        "nerfstudio's nerfacto",
+        "pipeline/_model.field.mlp_base* pipeline/_model.field.mlp_head* pipeline/_model.proposal_networks.*",
+        ("config.yml", "dataparser_transforms.json"),
+    ),
+    "k-planes": System("K-Planes", "model/field.grids.0.0:* model/field.sigma_net.params:*", ("config.py",)),
+    "d2nerf": System("D²NeRF", "optimizer/target/model/static_nerf:*", ("options.json", "config.gin")),
+}
+
+
+# --- folders of runs ----------------------------------------------------------------------------------------
+
+
+def _of_folder(folder: Path) -> Checkpoint:
+    """The newest checkpoint of a run: the highest step that a name tells, fine before coarse, `last` before
+    any step. What is no checkpoint is passed over, a damaged one is an error."""
+    files = _files(folder)
+    found: list[Checkpoint] = []
+    for file in files[:MAX_TRIED]:
+        if found and _rank(file) < _rank(found[0].path):
+            break
+        try:
+            found.append(open_checkpoint(file))
+        except UnknownCheckpoint:
+            continue
+    if not found:
+        names = f"{files[0].name} is none" if files else f"no file named {', '.join(ENDINGS)}"
+        raise UnknownCheckpoint(
+            f"{folder}: holds no checkpoint of a known system ({names}); {known_systems()}"
+        )
+    if len(found) > 1:
+        names = listed(checkpoint.path.name for checkpoint in found)
+        raise UnknownCheckpoint(
+            f"{folder}: holds {counted(len(found), 'checkpoint', 'checkpoints')}: {names}; give one"
+        )
+    found[0].notes.append(f"{folder}: its newest checkpoint {found[0].path.name} is taken")
+    return found[0]
+
+
+def _files(folder: Path) -> list[Path]:
+    """Files of a folder, or of its folder of checkpoints, that may be checkpoints: the newest first."""
+    files: list[Path] = []
+    for place in (*(folder / name for name in FOLDERS), folder):
+        if place.is_dir() and not files:
+            files = [
+                file
+                for file in sorted(place.iterdir())[:MAX_FILES]
+                if (file.suffix in ENDINGS or re.fullmatch(r"checkpoint_\d+", file.name)) and file.is_file()
+            ]
+    return sorted(files, key=_rank, reverse=True)
+
+
+def _rank(file: Path) -> tuple[bool, bool, int]:
+    """How new a checkpoint is by its name."""
+    number = re.search(r"(\d{1,18})$", file.stem)
+    return not file.stem.startswith("coarse"), "last" in file.stem, int(number[1]) if number else -1
