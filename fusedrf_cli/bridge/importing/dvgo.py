@@ -111,7 +111,9 @@ def space_and_placement(kwargs: Entries, state: Entries, box: np.ndarray):
         raise FormatError(f"model_kwargs: 'contracted_norm' should be inf or l2, found {str(norm)[:40]!r}")
     shell = box[3] - 1
     if not 0 < shell <= 1 or not np.allclose(np.abs(box), box[3]):
-        raise FormatError(f"the box of a contracted scene should be a cube up to 1 to 2, found {box.tolist()}")
+        raise FormatError(
+            f"the box of a contracted scene should be a cube up to 1 to 2, found {box.tolist()}"
+        )
     placement = np.eye(4)
     placement[:3, :3] = np.diag(np.broadcast_to(state.array("scene_radius").astype(np.float64), 3))
     placement[:3, 3] = state.array("scene_center", 3)
@@ -123,7 +125,9 @@ def cells_of(state: Entries, box: np.ndarray, space) -> OccupancyGrid:
     if "mask_cache.mask" not in state.values:
         return OccupancyGrid.full(box, space=space)
     mask = state.array("mask_cache.mask", None, None, None) > 0
-    scale, shift = (state.array(f"mask_cache.xyz2ijk_{name}", 3).astype(np.float64) for name in ("scale", "shift"))
+    scale, shift = (
+        state.array(f"mask_cache.xyz2ijk_{name}", 3).astype(np.float64) for name in ("scale", "shift")
+    )
     if not (scale > 0).all():
         raise FormatError("'mask_cache.xyz2ijk_scale' should be above 0")
     faces = [(-0.5 - shift) / scale, (np.array(mask.shape) - 0.5 - shift) / scale]

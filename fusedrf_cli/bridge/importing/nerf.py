@@ -65,7 +65,9 @@ def read_krrish(checkpoint, box: np.ndarray) -> Imported:
     out = stacked(state.layer("fc_alpha"), (np.eye(hidden), None))
     sigma, sections = skipping([*layers, out], frequencies, hidden_first=True)
     features, first = state.layer("fc_feat"), state.layer("layers_dir.0")
-    order, columns = seen(sigma["outputs"], hidden, (np.zeros((1, first[0].shape[1] - len(features[0]) + hidden)), None))
+    order, columns = seen(
+        sigma["outputs"], hidden, (np.zeros((1, first[0].shape[1] - len(features[0]) + hidden)), None)
+    )
     directions = len(columns) - hidden
     # A direction e passes a rectified layer as max(0, e) and max(0, -e).
     made, count = np.zeros((len(features[0]) + 2 * directions, len(columns))), len(features[0])
@@ -97,7 +99,9 @@ def frequencies_of(inputs: int) -> int:
     """Of an encoding of so many numbers: three, and six for each."""
     count, rest = divmod(inputs - 3, 6)
     if rest or not 0 <= count <= 24:
-        raise FormatError(f"a network of points should read 3 numbers and 6 for each frequency, found {inputs}")
+        raise FormatError(
+            f"a network of points should read 3 numbers and 6 for each frequency, found {inputs}"
+        )
     return count
 
 
@@ -143,7 +147,12 @@ def skipping(
             own, point = parts if hidden_first else reversed(parts)
             layers[i], again = (own, bias), {i: point}
     hidden, width = check_layers(layers, inputs), eight(inputs)
-    entry = {"part": "trunk", "hidden": hidden, "outputs": eight(len(layers[-1][0])), "layers": len(layers) - 1}
+    entry = {
+        "part": "trunk",
+        "hidden": hidden,
+        "outputs": eight(len(layers[-1][0])),
+        "layers": len(layers) - 1,
+    }
     sections = {}
     for i, (weight, bias) in enumerate(layers):
         weight = scattered(weight, np.arange(inputs), width) if i == 0 else weight

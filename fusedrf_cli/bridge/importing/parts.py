@@ -90,7 +90,9 @@ class Entries:
         """A whole number between two."""
         value = self.number(name, default)
         if value != int(value) or not low <= value <= high:
-            raise FormatError(f"{self.where}'{name}' should be a whole number from {low} to {high}, found {value}")
+            raise FormatError(
+                f"{self.where}'{name}' should be a whole number from {low} to {high}, found {value}"
+            )
         return int(value)
 
     def layers(self, prefix: str) -> list[Layer]:
@@ -174,7 +176,9 @@ class ColourInput:
     def at(self, which: str) -> np.ndarray:
         """The rows of the features, the direction or the point."""
         start = {"features": 0, "direction": self.width, "point": self.core - 3}[which]
-        count = {"features": self.features, "direction": HARMONICS if self.harmonics else 3, "point": 3}[which]
+        count = {"features": self.features, "direction": HARMONICS if self.harmonics else 3, "point": 3}[
+            which
+        ]
         return start + np.arange(count)
 
     def waves(self, which: str, frequencies: int, by_level: bool = False) -> np.ndarray:

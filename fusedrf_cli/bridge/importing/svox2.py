@@ -16,13 +16,17 @@ def read(checkpoint) -> Imported:
     links = entries.get("links")
     links = np.asarray(links.array() if hasattr(links, "array") else links)
     if links.ndim != 3 or links.dtype.kind != "i" or min(links.shape) < 1:
-        raise FormatError(f"'links' should be whole numbers on a grid, found {links.dtype} {list(links.shape)}")
+        raise FormatError(
+            f"'links' should be whole numbers on a grid, found {links.dtype} {list(links.shape)}"
+        )
     density, sh = numbers_of(entries)
     coefficients = sh.shape[1] // 3
     if links.max(initial=-1) >= len(density):
         raise FormatError(f"'links' should lead to one of {len(density)} rows, found {links.max()}")
     if np.prod(np.array(links.shape) + 2, dtype=float) > MAX_VERTICES:
-        raise LimitExceeded(f"'links' has {list(links.shape)} voxels, more than {MAX_VERTICES:,} are not read")
+        raise LimitExceeded(
+            f"'links' has {list(links.shape)} voxels, more than {MAX_VERTICES:,} are not read"
+        )
     shape = PartsShape(
         {"part": "grid", "numbers": 1}, {"part": "grid", "numbers": 3 * coefficients},
         {"part": "density_sum", "activation": "relu"}, {"part": "sh", "coefficients": coefficients}, "relu",

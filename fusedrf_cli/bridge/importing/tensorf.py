@@ -63,7 +63,11 @@ def factors(state: Entries, which: str, planes: bool) -> tuple[dict[str, np.ndar
         if len(set(ranks)) > 1:
             raise FormatError(f"lines of '{which}' have {ranks} components, expected as many on each axis")
         made = {f"line_{2 - i}": line.T for i, line in enumerate(lines)}
-        return {name: np.pad(line, ((0, 0), (0, rank - ranks[0]))) for name, line in made.items()}, resolution, ranks[:1]
+        return (
+            {name: np.pad(line, ((0, 0), (0, rank - ranks[0]))) for name, line in made.items()},
+            resolution,
+            ranks[:1],
+        )
     made = {}
     for i, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
         plane = state.array(f"{which}_plane.{i}", 1, ranks[i], resolution[b], resolution[a])[0]
@@ -73,9 +77,7 @@ def factors(state: Entries, which: str, planes: bool) -> tuple[dict[str, np.ndar
     return made, resolution, ranks
 
 
-def shading_of(
-    kwargs: Entries, state: Entries, basis: np.ndarray
-) -> tuple[dict, dict[str, np.ndarray], str]:
+def shading_of(kwargs: Entries, state: Entries, basis: np.ndarray) -> tuple[dict, dict[str, np.ndarray], str]:
     """The entry of the colour's decoder, its sections, and the activation of colours."""
     mode, count = kwargs.get("shadingMode"), len(basis)
     if mode == "SH":
@@ -87,7 +89,9 @@ def shading_of(
             raise FormatError(f"'basis_mat.weight' should have 3 rows for RGB shading, found {count}")
         return {"part": "sh_basis", "coefficients": 1}, {"rgb_basis": basis[:, None] / Y0}, "none"
     if mode not in ("MLP_Fea", "MLP_PE", "MLP"):
-        raise FormatError(f"kwargs: 'shadingMode' {str(mode)[:40]!r} is not known: MLP_Fea, MLP_PE, MLP, SH, RGB")
+        raise FormatError(
+            f"kwargs: 'shadingMode' {str(mode)[:40]!r} is not known: MLP_Fea, MLP_PE, MLP, SH, RGB"
+        )
     view = kwargs.whole("view_pe", 0, MAX_FREQUENCIES, 6)
     features = kwargs.whole("fea_pe", 0, MAX_FREQUENCIES, 6) if mode == "MLP_Fea" else 0
     points = kwargs.whole("pos_pe", 0, MAX_FREQUENCIES, 6) if mode == "MLP_PE" else 0
@@ -97,7 +101,7 @@ def shading_of(
     if mode == "MLP_PE":
         # forks differ in whether the point itself is read
         whole = count + 3 + 3 + 6 * points + 6 * view
-        columns += ([order.at("point")] if layers[0][0].shape[1] == whole else [])
+        columns += [order.at("point")] if layers[0][0].shape[1] == whole else []
         columns += [order.waves("point", points)]
     if mode == "MLP_Fea":
         columns += [order.waves("features", features)]
@@ -113,7 +117,12 @@ def cells_of(entries: Entries, box: np.ndarray) -> OccupancyGrid:
     shape = [int(n) for n in np.asarray(entries.get("alphaMask.shape")).reshape(-1)][-3:]
     bits = entries.get("alphaMask.mask")
     bits = bits.array() if hasattr(bits, "array") else np.asarray(bits)
-    if len(shape) != 3 or min(shape) < 2 or bits.dtype != np.uint8 or bits.size * 8 < np.prod(shape, dtype=float):
+    if (
+        len(shape) != 3
+        or min(shape) < 2
+        or bits.dtype != np.uint8
+        or bits.size * 8 < np.prod(shape, dtype=float)
+    ):
         raise FormatError(f"'alphaMask.mask' should be the bits of a grid, of 'alphaMask.shape' {shape}")
     samples = np.unpackbits(bits.reshape(-1), count=int(np.prod(shape))).reshape(shape).astype(bool).T
     mask_box = entries.array("alphaMask.aabb", 2, 3).astype(np.float64).reshape(6)
@@ -123,6 +132,9 @@ def cells_of(entries: Entries, box: np.ndarray) -> OccupancyGrid:
 def between(samples: np.ndarray) -> np.ndarray:
     """(X - 1, Y - 1, Z - 1) which cells between samples (X, Y, Z) bool have any at a corner."""
     for axis in range(3):
-        low, high = (np.take(samples, indices, axis) for indices in (range(samples.shape[axis] - 1), range(1, samples.shape[axis])))
+        low, high = (
+            np.take(samples, indices, axis)
+            for indices in (range(samples.shape[axis] - 1), range(1, samples.shape[axis]))
+        )
         samples = low | high
     return samples

@@ -7,6 +7,7 @@ import numpy as np
 
 from formats.errors import FormatError
 from fusedrf_cli.bridge.importing.cells import cells_of_bits
+from fusedrf_cli.bridge.importing.nerf import frequencies_of, joined, skipping
 from fusedrf_cli.bridge.importing.parts import (
     ColourInput,
     Entries,
@@ -19,8 +20,6 @@ from fusedrf_cli.bridge.importing.parts import (
     ranks_filled,
     trunk_layers,
 )
-from fusedrf_cli.bridge.importing.nerf import frequencies_of, joined, skipping
-from fusedrf_cli.engine.encodings import hash_grid
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsShape
 
@@ -84,7 +83,9 @@ def volume(checkpoint) -> Imported:
     grid = model.array("tensor_volume.0", 1, None, None, None, None)[0].transpose(3, 2, 1, 0)
     coefficients, rest = divmod(grid.shape[-1] - 1, 3)
     if rest or coefficients not in (1, 4, 9, 16):
-        raise FormatError(f"'tensor_volume.0' should have 1 and 3 times 1, 4, 9 or 16 channels, found {grid.shape[-1]}")
+        raise FormatError(
+            f"'tensor_volume.0' should have 1 and 3 times 1, 4, 9 or 16 channels, found {grid.shape[-1]}"
+        )
     shape = PartsShape(
         {"part": "grid", "numbers": 1}, {"part": "grid", "numbers": 3 * coefficients},
         {"part": "density_sum", "activation": "exp", "limits": LIMITS},
@@ -145,7 +146,9 @@ def levels_of(offsets: np.ndarray, rows: int, bound: float) -> list[dict]:
         scale = np.exp2(np.float32(level) * growth) * np.float32(BASE) - np.float32(1)
         side = int(np.ceil(scale)) + 2
         hashed = bool(side**3 > held)
-        levels.append({"scale": float(scale), "side": side, "rows": int(held), "hashed": hashed, "offset": 0.5})
+        levels.append(
+            {"scale": float(scale), "side": side, "rows": int(held), "hashed": hashed, "offset": 0.5}
+        )
     return levels
 
 
