@@ -8,7 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.decoders import density_sum, mlp, rgb, sh, sh_basis, sh_mlp, trunk
+from fusedrf_cli.engine.decoders import (
+    density_linear,
+    density_sum,
+    direction_basis,
+    mlp,
+    rgb,
+    sh,
+    sh_basis,
+    sh_mlp,
+    trunk,
+)
 from fusedrf_cli.engine.encodings import (
     frequencies,
     grid,
@@ -17,6 +27,7 @@ from fusedrf_cli.engine.encodings import (
     line,
     plane_line,
     plane_line_hash,
+    planes,
     trunk_features,
 )
 from fusedrf_cli.engine.encodings.hash_runs import HashGrid
@@ -40,6 +51,8 @@ DENSITIES = {
     "plane_line_hash": (plane_line_hash, {"rank": 8, "hashed": RUNS}),
     "frequencies": (frequencies, {"count": 2}),
     "frame_frequencies": (frequencies, {"count": 3, "frame": True}),
+    "planes": (planes, {"features": 8, "scales": [(4, 3, 5), (7, 6, 2)]}),
+    "planes_lines": (planes, {"features": 8, "scales": [(4, 3, 5), (7, 6, 2)], "summed": True, "lines": True}),
     "always_hashed": (hash_grid, {"features": 2, "levels": BY_ALL}),
 }
 FEATURES = DENSITIES | {"plane_line": (plane_line, {"rank": 16}), "grid": (grid, {"numbers": 13})}
@@ -48,6 +61,7 @@ SIGMAS = {
     "density_sum": lambda width: (density_sum, {}),
     "exp": lambda width: (density_sum, {"activation": "exp"}),
     "relu": lambda width: (density_sum, {"activation": "relu"}),
+    "linear": lambda width: (density_linear, {"width": width}),
     "trunk": lambda width: (trunk, {"width": width, "hidden": 8, "outputs": 16}),
     "exp_trunk": lambda width: (trunk, {"width": width, "hidden": 8, "outputs": 8, "activation": "exp"}),
     "limited": lambda width: (density_sum, {"activation": "exp", "limits": (-0.5, 0.5)}),
@@ -57,6 +71,8 @@ COLOURS = {
     "rgb": lambda width: (rgb, {"width": width}),
     "sh_basis": lambda width: (sh_basis, {"width": width, "coefficients": 4}),
     "sh": lambda width: (sh, {"width": width, "coefficients": 4 if width >= 12 else 1}),
+    "direction_basis": lambda width: (direction_basis, {"width": width, "hidden": 8}),
+    "deep_basis": lambda width: (direction_basis, {"width": width, "hidden": 16, "layers": 3}),
     "sh_mlp": lambda width: (sh_mlp, {"width": width, "hidden": 8}),
     "mlp": lambda width: (mlp, {"width": width, "rows": 5, "hidden": 11}),
     "deep_mlp": lambda width: (
@@ -118,7 +134,9 @@ PRODUCTS += [
     Recipe("frame_frequencies", "of 8", "deep_trunk", "deep_mlp"),
     Recipe("always_hashed", "grid", "exp_trunk", "mlp_of_points"),
     Recipe("line", "grid", "limited", "mlp_of_harmonics"),
+    Recipe("planes_lines", "planes", "density_sum", "deep_basis"),
     Recipe("plane_line", "frequencies", "density_sum", "sh_mlp"),
+    Recipe("planes", "of 16", "linear", "direction_basis"),
 ]
 
 
