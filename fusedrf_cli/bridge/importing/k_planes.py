@@ -219,7 +219,9 @@ def hybrid_decoders(state, sigma_net, columns, width, codes, rest):
     weight, last = weight[order], last[order]
     last[0] += SHIFT * (rest["activation"] == "exp")
     limits = tuple(rest["limits"])
-    sigma, sections = trunk_layers([(first, bias), (weight, last)], width, columns, rest["activation"], limits)
+    sigma, sections = trunk_layers(
+        [(first, bias), (weight, last)], width, columns, rest["activation"], limits
+    )
     read = HARMONICS + GEOMETRY + (0 if codes is None else len(codes))
     params = halves(state, FIELD + "color_net.params")
     shapes = tcnn.shapes_of(read, HIDDEN, 2, 3, tcnn.PADDED["FullyFusedMLP"])

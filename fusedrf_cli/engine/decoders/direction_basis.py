@@ -1,5 +1,5 @@
-"""Colour by a learnt basis of directions: logit_c = Σ_r features_r B[c, r](d). B is what a small network makes
-of the direction: LAYERS rectified layers of HIDDEN outputs and one of 3 WIDTH (K-Planes' explicit decoder,
+"""Colour by a learnt basis of directions: logit_c = Σ_r features_r B[c, r](d). B is what a small network
+makes of the direction: LAYERS rectified layers of HIDDEN outputs and one of 3 WIDTH (K-Planes' explicit decoder,
 Fridovich-Keil et al., CVPR 2023, sec. 3.3). It is computed once per ray."""
 
 from typing import NamedTuple
@@ -70,9 +70,7 @@ def reference(
     return (made.view(-1, 3, width) * features[:, None]).sum(2)
 
 
-def bound(
-    field, sections: dict, features: torch.Tensor, width: int, layers: int = 1, **options
-) -> float:
+def bound(field, sections: dict, features: torch.Tensor, width: int, layers: int = 1, **options) -> float:
     """See decoders; no part of a direction is above 1."""
     most = torch.ones(INPUTS, dtype=torch.float64)
     for i in range(layers + 1):

@@ -52,7 +52,10 @@ DENSITIES = {
     "frequencies": (frequencies, {"count": 2}),
     "frame_frequencies": (frequencies, {"count": 3, "frame": True}),
     "planes": (planes, {"features": 8, "scales": [(4, 3, 5), (7, 6, 2)]}),
-    "planes_lines": (planes, {"features": 8, "scales": [(4, 3, 5), (7, 6, 2)], "summed": True, "lines": True}),
+    "planes_lines": (
+        planes,
+        {"features": 8, "scales": [(4, 3, 5), (7, 6, 2)], "summed": True, "lines": True},
+    ),
     "always_hashed": (hash_grid, {"features": 2, "levels": BY_ALL}),
 }
 FEATURES = DENSITIES | {"plane_line": (plane_line, {"rank": 16}), "grid": (grid, {"numbers": 13})}
@@ -76,13 +79,16 @@ COLOURS = {
     "sh_mlp": lambda width: (sh_mlp, {"width": width, "hidden": 8}),
     "mlp": lambda width: (mlp, {"width": width, "rows": 5, "hidden": 11}),
     "deep_mlp": lambda width: (
-        mlp, {"width": width, "rows": 0, "hidden": 8, "layers": 3, "frequencies": 3, "diffuse": True}
+        mlp,
+        {"width": width, "rows": 0, "hidden": 8, "layers": 3, "frequencies": 3, "diffuse": True},
     ),
     "mlp_of_harmonics": lambda width: (
-        mlp, {"width": width, "rows": 0, "hidden": 8, "frequencies": 0, "direction": "harmonics"}
+        mlp,
+        {"width": width, "rows": 0, "hidden": 8, "frequencies": 0, "direction": "harmonics"},
     ),
     "mlp_of_points": lambda width: (
-        mlp, {"width": width, "rows": 4, "hidden": 8, "layers": 1, "point": True, "limits": (-0.5, 0.5)}
+        mlp,
+        {"width": width, "rows": 4, "hidden": 8, "layers": 1, "point": True, "limits": (-0.5, 0.5)},
     ),
 }
 
@@ -163,7 +169,7 @@ def test_device_functions_send_back_what_autograd_does(field, shaded):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", range(1, 5))
+@pytest.mark.parametrize("number", range(1, 7))
 def test_compiled_products_answer_and_send_back_as_their_references(number):
     """Of parts that no kind is made of, which nothing else compiles."""
     field = product(PRODUCTS[-number])

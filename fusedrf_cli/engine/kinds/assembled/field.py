@@ -9,9 +9,26 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fusedrf_cli.engine.decoders import density_linear, density_sum, direction_basis, mlp, rgb, sh, sh_basis, trunk
+from fusedrf_cli.engine.decoders import (
+    density_linear,
+    density_sum,
+    direction_basis,
+    mlp,
+    rgb,
+    sh,
+    sh_basis,
+    trunk,
+)
 from fusedrf_cli.engine.decoders.activations import COLOURS
-from fusedrf_cli.engine.encodings import frequencies, grid, hash_grid, line, plane_line, planes, trunk_features
+from fusedrf_cli.engine.encodings import (
+    frequencies,
+    grid,
+    hash_grid,
+    line,
+    plane_line,
+    planes,
+    trunk_features,
+)
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 from fusedrf_cli.engine.fields.box import MAX_ANSWER
 from fusedrf_cli.engine.kernels.assembled import READS, assemble
