@@ -29,6 +29,7 @@ from fusedrf_cli.engine.encodings import (
     plane_line_hash,
     planes,
     trunk_features,
+    warped_frequencies,
 )
 from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
@@ -42,6 +43,9 @@ from .interpreted import assert_answers, assert_gradients, interpreted, samples
 RUNS = HashGrid((0.31, 0.07), 64)
 HASHED = {"features": 2, "levels": hash_grid.levels_of(4, 6, 3, 1.7)}
 BY_ALL = [{"scale": 5.0, "side": 5, "rows": 32, "hashed": True, "offset": 0.0}] * 3
+WARP = {"count": 2, "hidden": 8, "layers": 3, "skip": 2}
+SHEET = {"count": 3, "hidden": 16, "layers": 1, "skip": 0}
+WARPED = {"count": 1, "warp": WARP, "sheet": SHEET, "coordinates": 3, "coordinate_count": 2}
 DENSITIES = {
     "line": (line, {"rank": 8}),
     "plane_line": (plane_line, {"rank": 8}),
@@ -56,6 +60,8 @@ DENSITIES = {
         planes,
         {"features": 8, "scales": [(4, 3, 5), (7, 6, 2)], "summed": True, "lines": True},
     ),
+    "warped_frequencies": (warped_frequencies, WARPED),
+    "still_too": (warped_frequencies, WARPED | {"still": True, "warp": SHEET, "sheet": WARP}),
     "always_hashed": (hash_grid, {"features": 2, "levels": BY_ALL}),
 }
 FEATURES = DENSITIES | {"plane_line": (plane_line, {"rank": 16}), "grid": (grid, {"numbers": 13})}
@@ -91,6 +97,7 @@ COLOURS = {
         {"width": width, "rows": 4, "hidden": 8, "layers": 1, "point": True, "limits": (-0.5, 0.5)},
     ),
 }
+FRAMED = "frame_frequencies", "warped_frequencies", "still_too"
 
 
 @dataclass(frozen=True)
@@ -140,6 +147,8 @@ PRODUCTS += [
     Recipe("frame_frequencies", "of 8", "deep_trunk", "deep_mlp"),
     Recipe("always_hashed", "grid", "exp_trunk", "mlp_of_points"),
     Recipe("line", "grid", "limited", "mlp_of_harmonics"),
+    Recipe("still_too", "of 8", "exp_trunk", "rgb"),
+    Recipe("warped_frequencies", "of 8", "deep_trunk", "sh_mlp"),
     Recipe("planes_lines", "planes", "density_sum", "deep_basis"),
     Recipe("plane_line", "frequencies", "density_sum", "sh_mlp"),
     Recipe("planes", "of 16", "linear", "direction_basis"),
@@ -201,7 +210,7 @@ def test_no_answer_is_beyond_the_bound(field):
     field.check_answers()
     points, dirs = (torch.from_numpy(values) for values in samples(field, 500))
     sigma, rgb = field.reference(field.params, points, dirs)
-    far = 1e5 if field.shape.density == "frame_frequencies" else 1  # no box is known to the bound
+    far = 1e5 if field.shape.density in FRAMED else 1  # no box is known to the bound
     if field.slots["sigma"].sizes["ACTIVATION"] == 0:
         raw = torch.expm1(sigma / field.scale).log() - field.shift
         assert raw.abs().max() <= bounds["density"] < 1e4 * far
