@@ -1,6 +1,6 @@
 """Colour by a learnt basis of directions: logit_c = Σ_r features_r B[c, r](d). B is what a small network
-makes of the direction: LAYERS rectified layers of HIDDEN outputs and one of 3 WIDTH (K-Planes' explicit decoder,
-Fridovich-Keil et al., CVPR 2023, sec. 3.3). It is computed once per ray."""
+makes of the direction: LAYERS rectified layers of HIDDEN outputs and one of 3 WIDTH (K-Planes' explicit
+decoder, Fridovich-Keil et al., CVPR 2023, sec. 3.3). It is computed once per ray."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,8 @@ import torch
 
 from fusedrf_cli.engine.fields.box import ParameterBlock
 from fusedrf_cli.engine.fields.part_options import Layers, Width
-from fusedrf_cli.engine.kernels.primitives import add_scaled, dense, dense_backward, dot, rectify
+from fusedrf_cli.engine.kernels.networks import network, network_backward
+from fusedrf_cli.engine.kernels.primitives import add_scaled, dot
 
 INPUTS = 3
 """Of the network: the direction itself."""
@@ -36,10 +37,10 @@ def layer_shapes(width: int, hidden: int, layers: int = 1) -> list[tuple[int, in
 
 def sizes(width: int, hidden: int, layers: int = 1) -> dict[str, int]:
     """See decoders; scratch holds B, its gradient, this 0 between rays, that of the features, the direction,
-    what the layers made of it, and the gradients of two layers. Features are kept."""
+    what the layers made of it, and the gradients of two layers and of the direction. Features are kept."""
     rooms = {
         "BASIS": 3 * width, "D_BASIS": 3 * width, "D_FEATURES": width, "DIRECTION": 8, "H": layers * hidden,
-        "D_H": hidden, "D_BEFORE": hidden,
+        "D_H": hidden, "D_BEFORE": hidden, "D_DIRECTION": 8,
     }  # fmt: skip
     starts = np.cumsum([0, *rooms.values()]).tolist()
     return {
@@ -84,29 +85,22 @@ def bound(field, sections: dict, features: torch.Tensor, width: int, layers: int
 
 def ray_setup(field, d, scratch):
     """B of the direction into scratch[AT + BASIS:], channel by channel."""
-    x, h, params = np.uint64(AT + DIRECTION), np.uint64(AT + H), field.params
+    x = np.uint64(AT + DIRECTION)
     scratch[x], scratch[x + np.uint64(1)], scratch[x + np.uint64(2)] = d
-    dense(INPUTS, HIDDEN, params, np.uint64(field.layers[0]), scratch, x, scratch, h)
-    rectify(HIDDEN, scratch, h)
-    for layer in range(1, LAYERS):
-        below, h = h, h + np.uint64(HIDDEN)
-        dense(HIDDEN, HIDDEN, params, np.uint64(field.layers[layer]), scratch, below, scratch, h)
-        rectify(HIDDEN, scratch, h)
-    last = np.uint64(field.layers[LAYERS])
-    dense(HIDDEN, OUTPUTS, params, last, scratch, h, scratch, np.uint64(AT + BASIS))
+    network(
+        INPUTS, HIDDEN, LAYERS, 0, OUTPUTS, field.params, field.layers, scratch, x, np.uint64(AT + H),
+        np.uint64(AT + BASIS),
+    )  # fmt: skip
 
 
 def ray_backward(field, d, scratch, grad):
     """Adjoint of `ray_setup`; clears the gradient."""
-    params, d_basis, h = field.params, np.uint64(AT + D_BASIS), np.uint64(AT + H + (LAYERS - 1) * HIDDEN)
-    d_h, d_before, last = np.uint64(AT + D_H), np.uint64(AT + D_BEFORE), np.uint64(field.layers[LAYERS])
-    dense_backward(HIDDEN, OUTPUTS, params, last, scratch, h, True, scratch, d_basis, scratch, d_h, grad)
-    for back in range(1, LAYERS):
-        layer, h = np.uint64(field.layers[LAYERS - back]), h - np.uint64(HIDDEN)
-        dense_backward(HIDDEN, HIDDEN, params, layer, scratch, h, True, scratch, d_h, scratch, d_before, grad)
-        d_h, d_before = d_before, d_h
-    x, first = np.uint64(AT + DIRECTION), np.uint64(field.layers[0])
-    dense_backward(INPUTS, HIDDEN, params, first, scratch, x, False, scratch, d_h, scratch, d_before, grad)
+    d_basis = np.uint64(AT + D_BASIS)
+    network_backward(
+        INPUTS, HIDDEN, LAYERS, 0, OUTPUTS, field.params, field.layers, scratch, np.uint64(AT + DIRECTION),
+        np.uint64(AT + H), d_basis, np.uint64(AT + D_H), np.uint64(AT + D_BEFORE),
+        np.uint64(AT + D_DIRECTION), grad,
+    )  # fmt: skip
     for r in range(np.uint64(OUTPUTS)):
         scratch[d_basis + r] = 0
 
