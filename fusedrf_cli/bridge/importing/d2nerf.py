@@ -310,6 +310,10 @@ class Dynamic:
         place = self.state.inside("hyper_sheet_mlp").inside("MLP_0")
         last = layer_of(place, "logit")
         if self.model.setting("use_residual", False):
+            if len(last[0]) != len(self.hyper_code):
+                raise FormatError(
+                    f"{place.where}'logit' should make {len(self.hyper_code)} numbers, as a code"
+                )
             last = last[0], (0 if last[1] is None else last[1]) + self.hyper_code
         made = self.moving(layers_of(place), last, "hyper_sheet_alpha", self.hyper_code, "density_sheet_")
         return made[0], len(last[0]), made[1]
