@@ -47,7 +47,7 @@ class Checkpoint:
     system: str
     entries: dict
     path: Path
-    beside: dict[str, object] = field(default_factory=dict)
+    beside: dict[str, dict] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 
@@ -67,6 +67,8 @@ def open_checkpoint(path: Path | str) -> Checkpoint:
     LimitExceeded, NewerVersion, OlderVersion, MissingFile, NotAFile, ResourceError.
     """
     path = Path(path)
+    if path.name == "config.yml" and (path.parent / FOLDERS[0]).is_dir():  # how nerfstudio names a run
+        path = path.parent
     if path.is_dir():
         return _of_folder(path)
     entries = _entries(path)
