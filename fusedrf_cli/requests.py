@@ -374,8 +374,8 @@ class RenderRequest(Writing, Running):
     far: Positive = math.inf
     """Distance up to which it is shown."""
     step: Positive | None = None
-    """How far samples of a ray lie apart, in the world's units where nothing is contracted; of several fields,
-    of the finest one. None: half the finest voxel."""
+    """How far samples of a ray lie apart, in the world's units where nothing is contracted; of several
+    fields, of the finest one. None: half the finest voxel."""
     size: Size | None = None
     background: Vector | None = (1.0, 1.0, 1.0)
     """None: transparent."""

@@ -23,8 +23,8 @@ from fusedrf_cli.request_parts import STDIO, ending_of
 from fusedrf_cli.requests import EditRequest, Writing
 
 __all__ = [
-    *("pose", "train", "import_field", "compose", "fuse", "convert", "add", "delete", "move", "duplicate", "rename"),
-    *("replace", "crop", "tint", "extract", "history", "undo"),
+    *("pose", "train", "import_field", "compose", "fuse", "convert", "add", "delete", "move", "duplicate"),
+    *("rename", "replace", "crop", "tint", "extract", "history", "undo"),
     *("render", "eval", "chart", "info", "kinds", "validate"),
 ]
 

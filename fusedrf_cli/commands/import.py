@@ -11,7 +11,7 @@ from fusedrf_cli.option_types import BoxType, InputType, PositiveType
 @options.writing("The bundle to write, FIELD.rfpack.")
 @click.option("--name", help="Name of its node; default: that of the file.")
 @click.option(
-    "--aabb", type=BoxType(), help="Where a field without a box of its own lies, xmin,ymin,zmin,xmax,ymax,zmax."
+    "--aabb", type=BoxType(), help="Where a field lies whose file has no box, xmin,ymin,zmin,xmax,ymax,zmax."
 )
 @click.option("--near", type=PositiveType(), metavar="LENGTH", help="Or nearest to the cameras that it does,")
 @click.option("--far", type=PositiveType(), metavar="LENGTH", help="and farthest from them.")

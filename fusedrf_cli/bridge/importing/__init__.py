@@ -1,6 +1,6 @@
 """`import`: another system's file to a bundle of its own numbers."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -52,8 +52,8 @@ def import_field(request: ImportRequest, progress) -> dict:
     if checkpoint.system not in READERS:
         known = ", ".join(SYSTEMS[name].title for name in READERS)
         raise InvalidInput(
-            f"{checkpoint.path}: a checkpoint of {SYSTEMS[checkpoint.system].title}, which is not read; read are "
-            f"those of {known}"
+            f"{checkpoint.path}: a checkpoint of {SYSTEMS[checkpoint.system].title}, which is not read; "
+            f"read are those of {known}"
         )
     capture = None if request.cameras is None else read_capture(request.cameras)
     parts = {"the field": COPIES * bytes_of(checkpoint.entries)}
@@ -67,8 +67,8 @@ def import_field(request: ImportRequest, progress) -> dict:
         "bytes": Path(request.output).stat().st_size,
         "system": SYSTEMS[checkpoint.system].title,
         "fields": [
-            {"name": leaf.name, "kind": node.field.kind, **registry.kind(node.field.kind).describe(node.field)}
-            for leaf, node in zip(graph.leaves(), imported.nodes, strict=True)
+            {"name": leaf.name, "kind": field.kind, **registry.kind(field.kind).describe(field)}
+            for leaf, field in zip(graph.leaves(), (n.field for n in imported.nodes), strict=True)
         ],
         "notes": notes,
         "memory": memory.report(),
@@ -126,7 +126,8 @@ def write(imported: Imported, request: ImportRequest, capture: Capture | None) -
         name = free_name(wanted + node.suffix, names)
         nodes.append(make_node(name, field=member, **placement_of(node.object_to_world)))
     if imported.rule != "max" and len(nodes) > 1:
-        nodes = [replace(make_node(free_name(wanted, names), children=tuple(nodes)), composition=imported.rule)]
+        group = make_node(free_name(wanted, names), children=tuple(nodes))
+        nodes = [replace(group, composition=imported.rule)]
     cameras = None
     if capture is not None:
         unbounded = any(node.field.space is not bounded for node in imported.nodes)
