@@ -129,12 +129,12 @@ def _splats(path, section: _Section, data: memoryview, level: int, span: tuple, 
 
 def _ordered(rest: np.ndarray, stored: int) -> np.ndarray:
     """(N, stored, 3) of numbers that lie by degree, then by colour, then by order."""
-    parts, at = [], 0
+    parts, at = [np.empty((len(rest), 0, 3))], 0
     for width in (3, 5, 7):
         if at < 3 * stored:
             parts.append(rest[:, at : at + 3 * width].reshape(-1, 3, width).transpose(0, 2, 1))
             at += 3 * width
-    return np.concatenate(parts, 1) if parts else rest.reshape(-1, 0, 3)
+    return np.concatenate(parts, 1)
 
 
 def _bucket_centres(path, section: _Section, data: memoryview) -> np.ndarray:
