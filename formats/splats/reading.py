@@ -8,6 +8,7 @@ from formats.errors import BadSplats
 from formats.ply_elements import MAX_HEADER
 from formats.safe_input import open_input, read_input
 from formats.splats.dot_splat import is_splat, read_splat
+from formats.splats.gltf import names_splats, read_gltf_splats
 from formats.splats.ksplat import is_ksplat, read_ksplat
 from formats.splats.ply import is_ply, read_ply
 from formats.splats.sog import is_meta, is_sog, read_sog
@@ -16,6 +17,7 @@ from formats.splats.spz import is_spz, read_spz
 
 HEAD = max(MAX_HEADER, 1 << 17)
 """Bytes of a file that are looked at first."""
+MAX_JSON = 64 << 20
 GIVE = "a .ply of 3DGS, .spz, .sog, .splat, .ksplat or .glb"
 
 
@@ -42,8 +44,21 @@ def _reader(path: Path | str) -> Callable[[Path | str, bytes], Splats] | None:
         return read_ply
     if is_spz(head):
         return read_spz
+    if names_splats(_json(path, head)):
+        return read_gltf_splats
     if is_sog(path) if head.startswith(b"PK\3\4") else is_meta(head):
         return read_sog
     if is_ksplat(head, size):
         return read_ksplat
     return read_splat if is_splat(head, size) else None
+
+
+def _json(path: Path | str, head: bytes) -> bytes:
+    """The JSON of a .glb or .gltf, or of any file that begins so, up to MAX_JSON; nothing of others."""
+    binary = head.startswith(b"glTF")
+    if not binary and head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] != b"{":
+        return b""
+    start, length = (20, int.from_bytes(head[12:16], "little")) if binary else (0, MAX_JSON)
+    with open_input(path) as file:
+        file.seek(start)
+        return file.read(min(length, MAX_JSON))
