@@ -26,10 +26,9 @@ def is_splat(head: bytes, size: int) -> bool:
     if not size or size % ROW.itemsize:
         return False
     rows = np.frombuffer(head, ROW, min(len(head) // ROW.itemsize, SAMPLE))
-    with np.errstate(invalid="ignore", over="ignore"):
-        likely = (np.abs(rows["centre"]) < FARTHEST).all(1)
-        likely &= (rows["scale"] >= 0).all(1) & (rows["scale"].max(1) > SMALLEST)
-        likely &= (rows["scale"] < LARGEST).all(1)
+    likely = (np.abs(rows["centre"]) < FARTHEST).all(1)
+    likely &= (rows["scale"] >= 0).all(1) & (rows["scale"].max(1) > SMALLEST)
+    likely &= (rows["scale"] < LARGEST).all(1)
     lengths = np.linalg.norm(_rotations(rows), axis=1)
     likely &= (np.abs(lengths - 1) < UNITS) | (lengths == 0)
     return len(rows) > 0 and likely.mean() >= LIKELY

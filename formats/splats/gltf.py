@@ -173,8 +173,7 @@ class _Reader:
             raise BadSplats(f"{self.path}: places splats by a node beyond any measure; export it again")
         scales = part.scales.astype(np.float64)
         if logarithms and not part.packed:
-            with np.errstate(over="ignore"):
-                scales = np.exp(scales)
+            scales = np.exp(scales)
         harmonics = np.zeros((len(scales), count, 3), np.float32)
         harmonics[:, : part.harmonics.shape[1]] = part.harmonics
         columns = {

@@ -73,8 +73,7 @@ class _Columns(dict):
             if not isinstance(self.get(name), np.ndarray):
                 raise BadSplats(f"{self.path}: its splats lack {name!r}; export it again")
         kind = np.float32 if self[names[0]].dtype.kind == "f" else self[names[0]].dtype.newbyteorder("=")
-        with np.errstate(over="ignore"):  # a double that is too large is infinite, and its splat left out
-            return np.stack([self[name].astype(kind) for name in names], 1)
+        return np.stack([self[name].astype(kind) for name in names], 1)
 
 
 def _series(columns: dict, stem: str) -> list[str]:
@@ -93,8 +92,7 @@ def _plain(path, vertices: _Columns, up: tuple[float, float, float], notes: list
     check_count(path, len(centres))
     axes, rest = _series(vertices, "scale_")[:3], _series(vertices, "f_rest_")
     opacities = sigmoid(vertices.rows(["opacity"])[:, 0])
-    with np.errstate(over="ignore"):
-        scales = np.exp(vertices.rows(axes or ["scale_0"]).astype(np.float64))
+    scales = np.exp(vertices.rows(axes or ["scale_0"]).astype(np.float64))
     if len(axes) < 3:
         thickness = FLAT * scales.min(1, keepdims=True)
         scales = np.concatenate([scales, np.repeat(thickness, 3 - len(axes), 1)], 1)
@@ -138,8 +136,7 @@ def _harmonics(path, vertices: _Columns, rest: list[str], notes: list[str]) -> n
 def _filtered(scales: np.ndarray, opacities: np.ndarray, least: np.ndarray) -> tuple:
     """Scales and opacities of splats blurred by Mip-Splatting's 3D filter, which keeps what they weigh."""
     wider = np.sqrt(scales**2 + least.astype(np.float64) ** 2)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return wider, opacities * np.prod(scales / wider, 1)
+    return wider, opacities * np.prod(scales / wider, 1)
 
 
 # --- compressed ---------------------------------------------------------------------------------------------
@@ -161,8 +158,7 @@ def _compressed(path, chunks: _Columns, vertices: _Columns, rest: _Columns, note
     rgb = colours[:, :3]
     if "min_r" in chunks:
         rgb = _spread(chunks, ("r", "g", "b"), rgb)
-    with np.errstate(over="ignore"):
-        scales = np.exp(_spread(chunks, ("scale_x", "scale_y", "scale_z"), _bits_11_10_11(scale)))
+    scales = np.exp(_spread(chunks, ("scale_x", "scale_y", "scale_z"), _bits_11_10_11(scale)))
     return gathered(
         path,
         "a compressed .ply of 3D Gaussian splats",
@@ -193,8 +189,7 @@ def _spread(chunks: _Columns, names: Sequence[str], shares: np.ndarray) -> np.nd
     chunk = np.arange(len(shares)) // CHUNK
     low = chunks.rows([f"min_{name}" for name in names]).astype(np.float64)[chunk]
     high = chunks.rows([f"max_{name}" for name in names]).astype(np.float64)[chunk]
-    with np.errstate(invalid="ignore"):
-        return low * (1 - shares) + high * shares
+    return low * (1 - shares) + high * shares
 
 
 def _smallest_three(values: np.ndarray) -> np.ndarray:

@@ -4,6 +4,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from formats.errors import BadSplats
 from formats.ply_elements import MAX_HEADER
 from formats.safe_input import open_input, read_input
@@ -34,9 +36,11 @@ def read_splats(path: Path | str) -> Splats:
     reader = _reader(path)
     if reader is None:
         raise BadSplats(f"{path}: holds no Gaussian splats that can be read; give {GIVE}")
-    return reader(path, read_input(path, MAX_FILE))
+    with np.errstate(all="ignore"):  # numbers that are none or beyond any measure are left out, and told
+        return reader(path, read_input(path, MAX_FILE))
 
 
+@np.errstate(all="ignore")
 def _reader(path: Path | str) -> Callable[[Path | str, bytes], Splats] | None:
     with open_input(path) as file:
         head, size = file.read(HEAD), os.fstat(file.fileno()).st_size

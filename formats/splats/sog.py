@@ -184,8 +184,7 @@ class _Reader:
         values = self._values(self.meta.sh0, colours[:, :3])
         opacities = sigmoid(self._range(self.meta.sh0, colours, 3)) if self.old else colours[:, 3] / 255
         scales = self._values(self.meta.scales, self._picture(self.meta.scales.files[0])[: self.count, :3])
-        with np.errstate(over="ignore"):
-            scales = np.exp(scales)
+        scales = np.exp(scales)
         harmonics = values.astype(np.float32)[:, None]
         if self.meta.rest is not None:
             harmonics = np.concatenate([harmonics, self._rest(self.meta.rest, notes)], 1)
@@ -250,9 +249,8 @@ class _Reader:
         low, high = (self._picture(name)[: self.count, :3].astype(np.float64) for name in means.files[:2])
         mins, maxs = np.array(means.mins), np.array(means.maxs)
         spans = np.where(maxs > mins, maxs - mins, 1)
-        with np.errstate(over="ignore"):
-            logs = mins + spans * ((low + 256 * high) / 65535)
-            return np.sign(logs) * np.expm1(np.abs(logs))
+        logs = mins + spans * ((low + 256 * high) / 65535)
+        return np.sign(logs) * np.expm1(np.abs(logs))
 
     def _rest(self, rest: Rest, notes: list[str]) -> np.ndarray:
         """(N, 3, 8 or 15, 3) float32 coefficients of the entries of the palette that splats have."""

@@ -95,8 +95,7 @@ def gathered(
 def _within(rows: np.ndarray) -> np.ndarray:
     """(N,) whether all numbers of a row are finite and not absurd."""
     axes = tuple(range(1, rows.ndim))
-    with np.errstate(invalid="ignore"):
-        return (rows.max(axes, initial=0) <= FARTHEST) & (rows.min(axes, initial=0) >= -FARTHEST)
+    return (rows.max(axes, initial=0) <= FARTHEST) & (rows.min(axes, initial=0) >= -FARTHEST)
 
 
 def _unit(quaternions: np.ndarray) -> np.ndarray:

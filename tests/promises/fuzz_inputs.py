@@ -1,7 +1,8 @@
 """Damaged captures, meshes, scenes and checkpoints: `python -m tests.promises.fuzz_inputs --seed 0`.
 
 `--readers N` mutates N inputs and has the readers read them in this process. `--commands N` has whole
-commands work on N of them, each in a child (commands.py). An input is wrong if it ended in anything but an
+commands work on N of them, each in a child (commands.py). `--splats N` mutates N files of splats of each
+format (splat_inputs.py). An input is wrong if it ended in anything but an
 error of the program's own, took too long or too much memory, did not end when it was asked to, or left a
 temporary. Every input follows from (seed, index).
 """
@@ -38,6 +39,7 @@ from tests.promises.fuzz import patience as patiently
 from tests.promises.inputs import CAPTURES, MESHES
 from tests.promises.kills import forked
 from tests.promises.mutations import DAMAGES, EDGES, TOKENS, spoilt_json
+from tests.promises.splat_inputs import splats
 
 EARLY = 0.2
 """Share of the commands that are asked to end after a moment."""
@@ -258,10 +260,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--readers", type=int, default=10_000)
     parser.add_argument("--commands", type=int, default=500)
+    parser.add_argument("--splats", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     found = {}
-    for tried, count in ((readers, options.readers), (commands, options.commands)):
+    for tried, count in ((readers, options.readers), (splats, options.splats), (commands, options.commands)):
         if count:
             with tempfile.TemporaryDirectory() as folder:
                 found[tried.__name__] = tried(count, options.seed, Path(folder))

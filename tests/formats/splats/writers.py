@@ -374,13 +374,19 @@ def gltf_of_spz(splats: Content, name: str = "KHR_gaussian_splatting_compression
 
 
 def glb(splats: Content) -> bytes:
-    """A .glb, as bytes."""
-    made = gltf(splats, translation=[0, 0, 0])
+    return as_glb(gltf(splats))
+
+
+def as_glb(made: Gltf) -> bytes:
     text = json.dumps(made.doc | {"buffers": [{"byteLength": len(made.blob)}]}).encode()
-    text, blob = text + b" " * (-len(text) % 4), made.blob + bytes(-len(made.blob) % 4)
-    chunks = (
-        struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(blob), 0x004E4942) + blob
-    )
+    return glb_of(text, made.blob)
+
+
+def glb_of(text: bytes, blob: bytes) -> bytes:
+    """A .glb of JSON and its binary chunk."""
+    text, blob = text + b" " * (-len(text) % 4), blob + bytes(-len(blob) % 4)
+    heads = struct.pack("<II", len(text), 0x4E4F534A), struct.pack("<II", len(blob), 0x004E4942)
+    chunks = heads[0] + text + heads[1] + blob
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
