@@ -30,8 +30,8 @@ HEADER = re.compile(
     re.DOTALL,
 )
 CHUNK = 256
-VERTICAL = re.compile(r"comment\s+vertical axis:\s*([xyz])", re.IGNORECASE)
-"""What nerfstudio writes."""
+UPRIGHT = re.compile(r"comment\s+vertical axis:\s*z\s*$", re.IGNORECASE)
+"""Nerfstudio's, whose world has z up. Brush writes y, whichever way is up."""
 FILTER = "filter_3D"
 """Of Mip-Splatting, the least size that cameras told apart (Yu et al. 2024, eq. 8)."""
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -55,8 +55,7 @@ def read_ply(path: Path | str, data: bytes) -> Splats:
     if compressed:
         columns = _Columns(path, chunks), _Columns(path, vertices), _Columns(path, rest)
         return _compressed(path, *columns, notes)
-    axis = next((match[1].lower() for line in lines if (match := VERTICAL.match(line))), "")
-    up = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": UP_Z}.get(axis, DOWN_Y)
+    up = UP_Z if any(UPRIGHT.match(line) for line in lines) else DOWN_Y
     return _plain(path, _Columns(path, vertices), up, notes)
 
 

@@ -29,8 +29,9 @@ def test_f_rest_goes_through_a_colour_after_the_other(tmp_path):
     assert read(tmp_path, columns).harmonics[1, 1:].tolist() == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
 
 
-def test_the_vertical_axis_of_nerfstudio_is_up(tmp_path):
-    assert read(tmp_path, ply_columns(content()), comment="Vertical Axis: z").up == (0, 0, 1)
+@pytest.mark.parametrize(("axis", "up"), [("z", (0, 0, 1)), ("y", (0, -1, 0))])
+def test_the_vertical_axis_of_nerfstudio_is_up_and_that_of_brush_says_nothing(axis, up, tmp_path):
+    assert read(tmp_path, ply_columns(content()), comment=f"Vertical Axis: {axis}").up == up
 
 
 def test_opacities_are_logits_also_infinite_ones(tmp_path):
