@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.errors import BadSplats, counted
-from formats.rotations import matrices, quaternions
-from formats.splats.harmonics import turned
+from formats.splats.placing import keeps_shapes, placed
 from formats.splats.splats import UP_Y, Splats, check_count, gathered
 from formats.splats.spz import read_spz
 from formats.surfaces import gltf_schema as schema
@@ -80,11 +79,7 @@ class _Reader:
         logarithms = any(part.scales.min(initial=0) < 0 for part in shown if not part.packed)
         if logarithms:
             self.notes.add("its scales are logarithms, as drafts of the extension had them; they are read so")
-        count = max(part.harmonics.shape[1] for part in shown)
-        pieces = [self._placed(self.parts[key], world, logarithms, count) for key, world in placements]
-        columns = {name: np.concatenate([each[name] for each in pieces]) for name in pieces[0]}
-        splats = gathered(self.path, "splats of glTF", up=UP_Y, **columns)
-        return replace(splats, notes=self.notes.sentences() + splats.notes)
+        return self._joined([self._placed(self.parts[key], world, logarithms) for key, world in placements])
 
     def _placements(self) -> tuple[list[tuple[tuple[int, int], np.ndarray]], int]:
         """Parts of splats by their keys and where each lies, and how many primitives are something else."""
@@ -165,40 +160,42 @@ class _Reader:
 
     # --- where they lie -------------------------------------------------------------------------------------
 
-    def _placed(
-        self, part: "_Part", world: np.ndarray, logarithms: bool, count: int
-    ) -> dict[str, np.ndarray]:
-        """Columns of `gathered`, in the world, with `count` coefficients."""
+    def _placed(self, part: "_Part", world: np.ndarray, logarithms: bool) -> Splats:
         if not np.abs(world).max() < FARTHEST:
             raise BadSplats(f"{self.path}: places splats by a node beyond any measure; export it again")
         scales = part.scales.astype(np.float64)
-        if logarithms and not part.packed:
-            scales = np.exp(scales)
-        harmonics = np.zeros((len(scales), count, 3), np.float32)
-        harmonics[:, : part.harmonics.shape[1]] = part.harmonics
-        columns = {
-            "centres": part.centres.astype(np.float64),
-            "scales": scales,
-            "rotations": part.rotations,
-            "opacities": part.opacities,
-            "harmonics": harmonics,
-        }
-        if np.array_equal(world, np.eye(4)):
-            return columns
-        splats = gathered(self.path, "", **columns)
+        splats = gathered(
+            self.path,
+            "splats of glTF",
+            centres=part.centres,
+            scales=np.exp(scales) if logarithms and not part.packed else scales,
+            rotations=part.rotations,
+            opacities=part.opacities,
+            harmonics=part.harmonics,
+        )
         for note in splats.notes:
             self.notes.add(note.removeprefix(f"{self.path}: "))
-        turn, conformal = _nearest_turn(world[:3, :3])
-        if not conformal and count > 1:
+        if np.array_equal(world, np.eye(4)):
+            return splats
+        if splats.harmonics.shape[1] > 1 and not keeps_shapes(world[:3, :3]):
             self.notes.add("nodes stretch splats; their colours are turned as by the nearest rotation")
-        scales, rotations = _stretched(splats, world[:3, :3])
-        return {
-            "centres": splats.centres.astype(np.float64) @ world[:3, :3].T + world[:3, 3],
-            "scales": scales,
-            "rotations": rotations,
-            "opacities": splats.opacities,
-            "harmonics": turned(splats.harmonics, turn),
-        }
+        return placed(splats, world)
+
+    def _joined(self, pieces: list[Splats]) -> Splats:
+        """With as many coefficients as any has."""
+        count = max(piece.harmonics.shape[1] for piece in pieces)
+        more = [[(0, 0), (0, count - piece.harmonics.shape[1]), (0, 0)] for piece in pieces]
+        splats = gathered(
+            self.path,
+            "splats of glTF",
+            centres=np.concatenate([piece.centres for piece in pieces]),
+            scales=np.concatenate([piece.scales for piece in pieces]),
+            rotations=np.concatenate([piece.rotations for piece in pieces]),
+            opacities=np.concatenate([piece.opacities for piece in pieces]),
+            harmonics=np.concatenate([np.pad(p.harmonics, w) for p, w in zip(pieces, more, strict=True)]),
+            up=UP_Y,
+        )
+        return replace(splats, notes=self.notes.sentences() + splats.notes)
 
 
 ATTRIBUTES = {"POSITION": 3, "SCALE": 3, "ROTATION": 4, "OPACITY": 1}
@@ -225,23 +222,3 @@ def _packed(primitive: schema.Primitive, where: str) -> Packed | None:
             if owner is not None and name in owner.extensions:
                 return owner.extension(name, Packed, where)
     return None
-
-
-def _nearest_turn(matrix: np.ndarray) -> tuple[np.ndarray, bool]:
-    """The orthogonal matrix nearest to a linear map, and whether that is it but for a size."""
-    u, sizes, v = np.linalg.svd(matrix)
-    return u @ v, bool(sizes[0] - sizes[2] <= 1e-5 * sizes[0])
-
-
-def _stretched(splats: Splats, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Scales and rotations of A R S² Rᵀ Aᵀ = U D² Uᵀ, where U D Vᵀ = A R S is a singular value decomposition;
-    U is a rotation or a mirror, and -U stands for the same Gaussian. Where A keeps shapes, axes keep their
-    order."""
-    turn, conformal = _nearest_turn(matrix)
-    axes = matrices(np.roll(splats.rotations, -1, axis=1))
-    if conformal:
-        u, scales = turn @ axes, splats.scales * np.cbrt(np.abs(np.linalg.det(matrix)))
-    else:
-        u, scales, _ = np.linalg.svd(matrix @ (axes * splats.scales[:, None]))
-    u = u * np.sign(np.linalg.det(u))[:, None, None]
-    return scales, np.roll(quaternions(u), 1, axis=1)

@@ -13,6 +13,7 @@ import numpy as np
 from formats.errors import BadSplats
 from formats.ply_elements import AXES, MAX_HEADER, read_elements, rgb_of
 from formats.splats.splats import (
+    ANTIALIASED,
     DOWN_Y,
     UP_Z,
     Splats,
@@ -35,8 +36,8 @@ UPRIGHT = re.compile(r"comment\s+vertical axis:\s*z\s*$", re.IGNORECASE)
 FILTER = "filter_3D"
 """Of Mip-Splatting, the least size that cameras told apart (Yu et al. 2024, eq. 8)."""
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-FLAT = 1e-3
-"""Thickness of a disc of 2D Gaussian splatting, which has two axes, as a share of the smaller one."""
+SMOOTHED = re.compile(r"comment\s+(splatrendermode:\s*mip|antialiased\s+1)\s*$", re.IGNORECASE)
+"""Brush's way to say that splats were trained with antialiasing, and Postshot's."""
 
 
 def is_ply(head: bytes) -> bool:
@@ -52,6 +53,8 @@ def read_ply(path: Path | str, data: bytes) -> Splats:
     compressed = set(PACKED) <= set(vertices)
     chunks, rest = (tables.pop("chunk", {}), tables.pop("sh", {})) if compressed else ({}, {})
     not_honoured(tables, notes, "elements")
+    if any(SMOOTHED.match(line) for line in lines):
+        notes.append(ANTIALIASED)
     if compressed:
         columns = _Columns(path, chunks), _Columns(path, vertices), _Columns(path, rest)
         return _compressed(path, *columns, notes)
@@ -93,9 +96,8 @@ def _plain(path, vertices: _Columns, up: tuple[float, float, float], notes: list
     opacities = sigmoid(vertices.rows(["opacity"])[:, 0])
     scales = np.exp(vertices.rows(axes or ["scale_0"]).astype(np.float64))
     if len(axes) < 3:
-        thickness = FLAT * scales.min(1, keepdims=True)
-        scales = np.concatenate([scales, np.repeat(thickness, 3 - len(axes), 1)], 1)
-        notes.append(f"its splats have {len(axes)} axes; they are shown with a thickness of {FLAT:g} of them")
+        scales = np.pad(scales, [(0, 0), (0, 3 - len(axes))])
+        notes.append("its splats are discs of 2D Gaussian splatting; they are shown as very thin ellipsoids")
     if FILTER in vertices:
         scales, opacities = _filtered(scales, opacities, vertices.rows([FILTER]))
     harmonics = _harmonics(path, vertices, rest, notes)

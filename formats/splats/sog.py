@@ -20,7 +20,7 @@ import numpy as np
 from formats.errors import BadSplats, LimitExceeded, NewerVersion
 from formats.images import DECODING_ERRORS
 from formats.safe_input import open_input, parse_json
-from formats.splats.splats import Splats, check_count, gathered, sigmoid
+from formats.splats.splats import ANTIALIASED, Splats, check_count, gathered, sigmoid
 from formats.surfaces.named_files import Beside
 
 META = "meta.json"
@@ -89,6 +89,8 @@ class Meta(msgspec.Struct, rename={"rest": "shN"}):
     rest: Rest | None = None
     version: int = 1
     count: int = 0
+    model: str = ""
+    """Brush's and SplatTransform's: "antialiased", "2dgs" or nothing."""
 
 
 # --- files --------------------------------------------------------------------------------------------------
@@ -179,7 +181,7 @@ class _Reader:
         check_count(path, max(self.count, 0), sum(map(len, self.files.values())))
 
     def splats(self) -> Splats:
-        notes: list[str] = []
+        notes = [ANTIALIASED] if self.meta.model == "antialiased" else []
         colours = self._picture(self.meta.sh0.files[0])[: self.count]
         values = self._values(self.meta.sh0, colours[:, :3])
         opacities = sigmoid(self._range(self.meta.sh0, colours, 3)) if self.old else colours[:, 3] / 255

@@ -18,6 +18,7 @@ THINNEST = 1e-6
 """Least share of a splat's longest axis that its others have. A disc has an axis of length 0, and nothing
 could be divided by it."""
 DOWN_Y, UP_Y, UP_Z = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+ANTIALIASED = "was trained with antialiasing (Mip-Splatting's 2D filter), which is not imitated"
 SH_0 = 0.28209479177387814
 """The constant harmonic: a colour is 0.5 + SH_0 times its first coefficient."""
 

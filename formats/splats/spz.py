@@ -1,7 +1,8 @@
 """Niantic's .spz, versions 1 to 4: quantised splats, packed by gzip as a whole or by zstd in streams.
 
 https://github.com/nianticlabs/spz (README.md, load-spz.cc). Positions, rotations and harmonics are stored
-with the axes right, up, back; a .ply of the same splats has right, down, front.
+with the axes right, up, back, or with those that an extension states; a .ply of the same splats has right,
+down, front. Nothing in a file tells whether its writer turned the axes, as the format asks.
 """
 
 import struct
@@ -10,9 +11,19 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.errors import BadSplats, NewerVersion, listed
+from formats.errors import BadSplats, NewerVersion
 from formats.splats.harmonics import basis
-from formats.splats.splats import UP_Y, Splats, check_count, coefficients_of, gathered
+from formats.splats.placing import placed
+from formats.splats.splats import (
+    ANTIALIASED,
+    DOWN_Y,
+    UP_Y,
+    Splats,
+    check_count,
+    coefficients_of,
+    gathered,
+    not_honoured,
+)
 
 MAGIC, GZIP = b"NGSP", b"\x1f\x8b"
 HEADER = struct.Struct("<4sIIBBBB")
@@ -21,13 +32,17 @@ STREAM = struct.Struct("<QQ")
 CONTAINER = 32
 """Bytes of version 4's header."""
 LATEST = 4
-ANTIALIASED, EXTENDED = 1, 2
+SMOOTHED, EXTENDED = 1, 2
 MAX_FRACTION = 23
 MAX_EXTENSIONS = 1 << 20
 COLOUR = 0.15
 """What a step of 1 of the first coefficient is of the range of a byte."""
-TURN = np.array([1.0, -1.0, -1.0])
-"""From right, up, back to right, down, front: each axis by itself."""
+AXES_EXTENSION = 0xADBE0003
+"""SPZ_ADOBE_coordinate_system, a number: less one, its bits say right, up and front (instead of left, down
+and back), and the last that all is turned about x, as where z is up."""
+RIGHT_UP_BACK, RIGHT_DOWN_FRONT = 4, 6
+Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From axes with z up to those with y up: -90 degrees about x."""
 
 
 def is_spz(head: bytes) -> bool:
@@ -76,8 +91,9 @@ class _Packed:
         check_count(path, self.count, n_bytes)
         self.stored, self.kept = coefficients_of(path, 3 * ((degree + 1) ** 2 - 1), notes)
         self.extended = bool(flags & EXTENDED)
-        if flags & ANTIALIASED:
-            notes.append("was trained with antialiasing (Mip-Splatting's 2D filter), which is not imitated")
+        if flags & SMOOTHED:
+            notes.append(ANTIALIASED)
+        self.axes = RIGHT_UP_BACK
         self.arrays: dict[str, np.ndarray] = {}
 
     @property
@@ -92,38 +108,43 @@ class _Packed:
             "harmonics": 3 * self.stored,
         }
 
-    def tell_extensions(self, data: bytes | memoryview) -> None:
-        """A note about records of type and length."""
+    def read_extensions(self, data: bytes | memoryview) -> None:
+        """Records of type and length: the one of axes is read, others are told."""
         names, at = [], 0
         while at + 8 <= len(data) and len(names) < 100:
             kind, length = struct.unpack_from("<II", data, at)
-            names.append(f"0x{kind:08X}")
             at += 8 + length
-        if names:
-            self.notes.append(f"holds extensions that are not honoured: {listed(names)}")
+            if kind == AXES_EXTENSION and length == 4 and at <= len(data):
+                (axes,) = struct.unpack_from("<I", data, at - 4)
+                self.axes = axes if 1 <= axes <= 16 else RIGHT_UP_BACK
+            else:
+                names.append(f"0x{kind:08X}")
+        not_honoured(names, self.notes, "extensions")
 
     # --- what the bytes stand for ---------------------------------------------------------------------------
 
     def splats(self, as_stored: bool) -> Splats:
-        turn = np.ones(3) if as_stored else TURN
+        """An axis that changes its sign changes those of harmonics, and two of a quaternion's."""
+        bits = self.axes - 1 ^ RIGHT_DOWN_FRONT - 1
+        turn = np.ones(3) if as_stored else 1.0 - 2 * np.array([bits & 1, bits >> 1 & 1, bits >> 2 & 1])
         point = np.array([[0.3, 0.5, 0.7]])
         signs = np.sign(basis(point * turn) / basis(point))[0, 1 : 1 + self.kept]
         harmonics = np.empty((self.count, 1 + self.kept, 3), np.float32)
         harmonics[:, 0] = (self._bytes("colours") / 255 - 0.5) / COLOUR
         rest = self.arrays["harmonics"].reshape(self.count, self.stored, 3)[:, : self.kept]
         np.multiply(rest.astype(np.float32) / 128 - 1, signs[:, None], out=harmonics[:, 1:], casting="unsafe")
-        return gathered(
+        splats = gathered(
             self.path,
             f"a .spz file of version {self.version}",
             centres=self._positions() * turn,
             scales=np.exp(self._bytes("scales") / 16 - 10),
-            # an axis turns with the product of the signs of the two others
             rotations=self._rotations() * np.concatenate([[1], turn.prod() * turn]),
             opacities=self._bytes("alphas")[:, 0] / 255,
             harmonics=harmonics,
-            up=UP_Y if as_stored else (0.0, -1.0, 0.0),
+            up=UP_Y if as_stored else DOWN_Y,
             notes=self.notes,
         )
+        return placed(splats, Z_UP) if bits & 8 and not as_stored else splats
 
     def _bytes(self, name: str) -> np.ndarray:
         return self.arrays[name].reshape(self.count, -1)
@@ -176,7 +197,7 @@ class _Legacy(_Packed):
         if self.unpack and not self.unpack.eof:  # so that its checksum is read
             raise BadSplats(f"{path}: is cut off, or goes on behind its splats; copy or export it again")
         if self.extended:
-            self.tell_extensions(extensions)
+            self.read_extensions(extensions)
 
     def _take(self, path: Path | str, size: int) -> bytes:
         """The next bytes, fewer at the end."""
@@ -211,7 +232,7 @@ class _Container(_Packed):
                 f"{len(names)} of them; copy or export it again"
             )
         if self.extended:
-            self.tell_extensions(data[CONTAINER:table])
+            self.read_extensions(data[CONTAINER:table])
         for index, name in enumerate(names):
             packed, size = STREAM.unpack_from(data, table + STREAM.size * index)
             if size != self.count * self.widths[name] or packed > len(data) - at:

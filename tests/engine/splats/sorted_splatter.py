@@ -1,5 +1,5 @@
-"""A plain splatter, to compare fields of splats with: Kerbl et al. 2023 (3D Gaussian Splatting), after Zwicker
-et al. 2001 (EWA splatting), without tiles.
+"""A plain splatter, to compare fields of splats with: Kerbl et al. 2023 (3D Gaussian Splatting) after
+Zwicker et al. 2001 (EWA splatting), without tiles.
 
 Centres are projected, and covariances by the Jacobian of the projection at the centre, whose slopes are held
 at 1.3 times those of the picture's border, as in the authors' program. Splats are sorted by the depth of

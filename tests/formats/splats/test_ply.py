@@ -73,8 +73,14 @@ def test_two_axes_are_a_disc(tmp_path):
     columns = ply_columns(content())
     del columns["scale_2"]
     splats = read(tmp_path, columns)
-    np.testing.assert_allclose(splats.scales[:, 2], 1e-3 * splats.scales[:, :2].min(1), rtol=1e-5)
-    assert "2 axes" in splats.notes[0]
+    np.testing.assert_allclose(splats.scales[:, 2], 1e-6 * splats.scales[:, :2].max(1), rtol=1e-5)
+    assert "discs" in splats.notes[0]
+
+
+@pytest.mark.parametrize("comment", ["SplatRenderMode: mip", "antialiased 1"])
+def test_antialiasing_is_told(comment, tmp_path):
+    assert "antialiasing" in read(tmp_path, ply_columns(content()), comment=comment).notes[0]
+    assert read(tmp_path, ply_columns(content()), comment="antialiased 0").notes == ()
 
 
 def test_the_filter_of_mip_splatting(tmp_path):

@@ -53,6 +53,10 @@ def test_labels_beyond_the_palette_are_told(tmp_path):
     assert not splats.harmonics[:, 1:].any() and "5 splats have no entry" in splats.notes[0]
 
 
+def test_antialiasing_is_told(tmp_path):
+    assert "antialiasing" in read(tmp_path, changed(sog_files(content()), model="antialiased")).notes[0]
+
+
 def test_newer_versions(tmp_path):
     with pytest.raises(NewerVersion, match="version 3"):
         read(tmp_path, changed(sog_files(content()), version=3))

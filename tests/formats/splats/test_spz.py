@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from formats.errors import BadSplats, LimitExceeded, NewerVersion
+from formats.splats.placing import placed
 from formats.splats.reading import is_splats, read_splats
 from formats.splats.spz import read_spz
 from tests.formats.splats import writers
+from tests.formats.splats.test_gltf import covariances
 from tests.formats.splats.writers import content, spz, spz_container, spz_header, spz_streams, written
 
 
@@ -58,6 +60,31 @@ def test_antialiasing_extensions_and_degree_4_are_told(tmp_path):
         notes = "\n".join(splats.notes)
         assert "antialiasing" in notes and "0xADBE0002" in notes and "degree 4" in notes
         np.testing.assert_allclose(splats.harmonics[:, 1:], expected.rest[:, :15], atol=0.5 / 128 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("axes", "stated"),
+    [
+        (4, [[1, 0, 0], [0, -1, 0], [0, 0, -1]]),  # right, up, back
+        (6, np.eye(3)),  # right, down, front
+        (7, [[-1, 0, 0], [0, -1, 0], [0, 0, 1]]),  # left, up, front
+        (8, [[1, 0, 0], [0, -1, 0], [0, 0, 1]]),  # right, up, front: a mirror
+        (12, [[1, 0, 0], [0, 0, -1], [0, 1, 0]]),  # right, front, up: z is -y of a .ply, and y its z
+        (11, [[-1, 0, 0], [0, 0, -1], [0, 1, 0]]),  # left, front, up: a mirror
+    ],
+)
+def test_axes_that_an_extension_states(axes, stated, tmp_path):
+    """`stated` takes what the file stores to right, down, front."""
+    splats, extension = content(), struct.pack("<III", 0xADBE0003, 4, axes)
+    streams = spz_streams(splats, 4, turned=False)
+    read_back = read(tmp_path, spz_container(splats, streams, extension))
+    matrix = np.eye(4)
+    matrix[:3, :3] = stated
+    expected = placed(read_spz("a", spz_container(splats, streams), as_stored=True), matrix)
+    np.testing.assert_allclose(read_back.centres, expected.centres, atol=1e-6)
+    np.testing.assert_allclose(read_back.harmonics, expected.harmonics, atol=1e-6)
+    np.testing.assert_allclose(covariances(read_back), covariances(expected), atol=1e-6)
+    assert read_back.up == (0, -1, 0) and read_back.notes == ()
 
 
 @pytest.mark.parametrize("version", [5, 2**32 - 1])
