@@ -1,7 +1,8 @@
 """Splats of glTF 2.0: primitives with KHR_gaussian_splatting, placed by their nodes, also packed as SPZ.
 
 https://github.com/KhronosGroup/glTF (extensions/2.0/Khronos/KHR_gaussian_splatting, as ratified, in which
-scales are linear; in drafts they were logarithms). What SPZ packs has the axes of the primitive.
+scales are linear; in drafts they were logarithms). glTF's axes are left, up, front; what SPZ packs has those
+of its primitive.
 """
 
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ import numpy as np
 
 from formats.errors import BadSplats, counted
 from formats.splats.placing import keeps_shapes, placed
-from formats.splats.splats import UP_Y, Splats, check_count, gathered
+from formats.splats.splats import Splats, check_count, gathered
 from formats.splats.spz import read_spz
 from formats.surfaces import gltf_schema as schema
 from formats.surfaces.accessors import Buffers
@@ -29,6 +30,8 @@ SPZ = (
 """The newest of its drafts first."""
 LINEAR = "lin_rec709_display"
 DEGREES = 3
+AXES = np.diag([-1.0, -1, 1, 1])
+"""From left, up, front to right, down, front."""
 FARTHEST = 1e12
 """Largest number of a node's placement."""
 
@@ -52,8 +55,8 @@ def names_splats(text: bytes) -> bool:
 
 
 def read_gltf_splats(path: Path | str, data: bytes) -> Splats:
-    """In the world of the file, y up. Raises BadJson, BadMesh, BadSplats, LimitExceeded, MissingExtra,
-    MissingFile, NewerVersion, OutsideFolder."""
+    """In the world of the file, but for its axes. Raises BadJson, BadMesh, BadSplats, LimitExceeded,
+    MissingExtra, MissingFile, NewerVersion, OutsideFolder."""
     notes = Notes(path)
     document, binary = read_document(path, data)
     check_extensions(document, path, notes, KNOWN | {SPLATTING, *SPZ})
@@ -175,11 +178,9 @@ class _Reader:
         )
         for note in splats.notes:
             self.notes.add(note.removeprefix(f"{self.path}: "))
-        if np.array_equal(world, np.eye(4)):
-            return splats
         if splats.harmonics.shape[1] > 1 and not keeps_shapes(world[:3, :3]):
             self.notes.add("nodes stretch splats; their colours are turned as by the nearest rotation")
-        return placed(splats, world)
+        return placed(splats, AXES @ world)
 
     def _joined(self, pieces: list[Splats]) -> Splats:
         """With as many coefficients as any has."""
@@ -193,7 +194,6 @@ class _Reader:
             rotations=np.concatenate([piece.rotations for piece in pieces]),
             opacities=np.concatenate([piece.opacities for piece in pieces]),
             harmonics=np.concatenate([np.pad(p.harmonics, w) for p, w in zip(pieces, more, strict=True)]),
-            up=UP_Y,
         )
         return replace(splats, notes=self.notes.sentences() + splats.notes)
 

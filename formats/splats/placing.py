@@ -6,7 +6,7 @@ import numpy as np
 
 from formats.rotations import matrices, quaternions
 from formats.splats.harmonics import turned
-from formats.splats.splats import Splats
+from formats.splats.splats import Splats, thickened
 
 
 def keeps_shapes(matrix: np.ndarray) -> bool:
@@ -18,7 +18,7 @@ def keeps_shapes(matrix: np.ndarray) -> bool:
 def placed(splats: Splats, matrix: np.ndarray) -> Splats:
     """Splats where a (4, 4) affine map A x + t puts them: covariances are A Σ Aᵀ, and a splat shows along A d
     what it showed along d. Exact where A keeps shapes; otherwise colours turn as by the nearest rotation or
-    mirror. Scales may come out as 0.
+    mirror.
 
     Σ is R S² Rᵀ, and A R S = U D Vᵀ gives U D² Uᵀ. U is a rotation, or a mirror, for which -U stands.
     """
@@ -30,10 +30,11 @@ def placed(splats: Splats, matrix: np.ndarray) -> Splats:
     else:
         u, scales, _ = np.linalg.svd(linear @ (axes * splats.scales[:, None]))
     u = u * np.sign(np.linalg.det(u))[:, None, None]
+    centres = splats.centres.astype(np.float64) @ linear.T + matrix[:3, 3]
     return replace(
         splats,
-        centres=splats.centres.astype(np.float64) @ linear.T + matrix[:3, 3],
-        scales=scales,
-        rotations=np.roll(quaternions(u), 1, axis=1),
+        centres=centres.astype(np.float32),
+        scales=thickened(scales),
+        rotations=np.roll(quaternions(u), 1, axis=1).astype(np.float32),
         harmonics=turned(splats.harmonics, left @ right),
     )

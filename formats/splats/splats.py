@@ -29,7 +29,8 @@ class Splats:
     its centre; its colour, seen along the unit direction d from the camera to the centre, is
     max(0, 0.5 + Σ Y_k(d) harmonics[i, k]), sRGB as captured, with the basis Y of `harmonics.py`.
 
-    The frame is that of a .ply of 3DGS of the same content, for every format but glTF, which has its own.
+    The frame is that of a .ply of 3DGS of the same content, with the axes right, down, front: what other
+    formats store with axes of their own (SPZ, glTF) is turned.
     """
 
     centres: np.ndarray
@@ -80,10 +81,9 @@ def gathered(
         centres, scales, rotations, opacities, harmonics = (
             each[sound] for each in (centres, scales, rotations, opacities, harmonics)
         )
-    scales = np.maximum(scales, THINNEST * scales.max(1, keepdims=True))
     return Splats(
         np.ascontiguousarray(centres, np.float32),
-        np.maximum(scales.astype(np.float32), np.finfo(np.float32).tiny),
+        thickened(scales),
         _unit(rotations),
         np.ascontiguousarray(opacities, np.float32),
         np.ascontiguousarray(harmonics, np.float32),
@@ -91,6 +91,12 @@ def gathered(
         up,
         tuple(printable(f"{path}: {note}") for note in notes),
     )
+
+
+def thickened(scales: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 scales of which none is 0."""
+    scales = np.maximum(scales, THINNEST * scales.max(1, keepdims=True))
+    return np.maximum(scales.astype(np.float32), np.finfo(np.float32).tiny)
 
 
 def _within(rows: np.ndarray) -> np.ndarray:

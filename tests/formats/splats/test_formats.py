@@ -101,7 +101,7 @@ def test_one_content_in_every_format(name, tmp_path):
     splats = read_splats(path)
     check(splats, expected, bounds)
     assert splats.notes == ()
-    assert splats.up == ((0, 1, 0) if name == "glb" else (0, -1, 0))
+    assert splats.up == (0, -1, 0)
 
 
 @pytest.mark.parametrize("name", ["ply compressed", "ksplat 1", "sog 2", "spz 4"])

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from formats.errors import BadMesh, BadSplats, LimitExceeded
 from formats.splats.harmonics import basis
+from formats.splats.placing import placed
 from formats.splats.reading import is_splats, read_splats
 from tests.formats.gltf import CORNERS, FACES
 from tests.formats.splats.test_formats import EXACT, SPZ, check
@@ -16,9 +17,10 @@ SPLATTING = "KHR_gaussian_splatting"
 
 
 def read(tmp_path, made, name: str = "a.glb"):
+    """In glTF's axes."""
     path = made.write(tmp_path / name)
     assert is_splats(path)
-    return read_splats(path)
+    return placed(read_splats(path), np.diag([-1, -1, 1, 1]))
 
 
 def covariances(splats) -> np.ndarray:

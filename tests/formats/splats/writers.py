@@ -374,7 +374,17 @@ def gltf_of_spz(splats: Content, name: str = "KHR_gaussian_splatting_compression
 
 
 def glb(splats: Content) -> bytes:
-    return as_glb(gltf(splats))
+    """With glTF's axes, which are left, up, front: a .ply's turned by 180 degrees about z."""
+    w, x, y, z = splats.rotations.T
+    signs = np.array([1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1])
+    turned = Content(
+        splats.centres * [-1, -1, 1],
+        splats.scales,
+        np.stack([-z, -y, x, w], 1),
+        splats.opacities,
+        splats.harmonics * signs[: splats.harmonics.shape[1], None],
+    )
+    return as_glb(gltf(turned))
 
 
 def as_glb(made: Gltf) -> bytes:
