@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.errors import BadSplats, counted
+from formats.errors import BadSplats, LimitExceeded, counted
 from formats.splats.placing import keeps_shapes, placed
 from formats.splats.splats import Splats, check_count, gathered
 from formats.splats.spz import read_spz
@@ -32,6 +32,7 @@ LINEAR = "lin_rec709_display"
 DEGREES = 3
 AXES = np.diag([-1.0, -1, 1, 1])
 """From left, up, front to right, down, front."""
+MAX_PLACEMENTS = 1000
 FARTHEST = 1e12
 """Largest number of a node's placement."""
 
@@ -77,12 +78,12 @@ class _Reader:
         if others:
             self.notes.add(f"{counted(others, 'primitive', 'primitives')} without splats left out")
         self.nodes.tell()
-        shown = [self.parts[key] for key, _ in placements]
-        check_count(self.path, sum(len(part.centres) for part in shown))
-        logarithms = any(part.scales.min(initial=0) < 0 for part in shown if not part.packed)
+        check_count(self.path, len(placements))
+        logarithms = any((part.scales < 0).any() for part in self.parts.values() if not part.packed)
         if logarithms:
             self.notes.add("its scales are logarithms, as drafts of the extension had them; they are read so")
-        return self._joined([self._placed(self.parts[key], world, logarithms) for key, world in placements])
+        sound = {key: self._sound(part, logarithms) for key, part in self.parts.items()}
+        return self._joined([self._placed(sound[key], world) for key, world in placements])
 
     def _placements(self) -> tuple[list[tuple[tuple[int, int], np.ndarray]], int]:
         """Parts of splats by their keys and where each lies, and how many primitives are something else."""
@@ -94,18 +95,20 @@ class _Reader:
             mesh = self.buffers.item("meshes", mesh_index)
             for number, primitive in enumerate(mesh.primitives):
                 where = f"{self.path}: mesh {mesh.name[:60] or mesh_index!r}, primitive {number}"
-                key = mesh_index, number
-                if key not in self.parts and not (
-                    _packed(primitive, where) or SPLATTING in primitive.extensions
-                ):
+                if SPLATTING not in primitive.extensions and _packed(primitive, where) is None:
                     others += 1
                     continue
+                key = mesh_index, number
                 if key not in self.parts:
                     self.parts[key] = self._part(primitive, where)
                 worlds = self.nodes.instances(index)
-                total += len(worlds) * len(self.parts[key].centres)
-                check_count(self.path, max(total, 1), max(self.buffers.size, 1))
                 placements += [(key, world) for world in worlds]
+                total += len(worlds) * len(self.parts[key].centres)
+                check_count(self.path, max(total, 1), self.buffers.size)
+                if len(placements) > MAX_PLACEMENTS:
+                    raise LimitExceeded(
+                        f"{self.path}: places splats more than {MAX_PLACEMENTS:,} times; join its primitives"
+                    )
         return placements, others
 
     # --- primitives -----------------------------------------------------------------------------------------
@@ -163,9 +166,7 @@ class _Reader:
 
     # --- where they lie -------------------------------------------------------------------------------------
 
-    def _placed(self, part: "_Part", world: np.ndarray, logarithms: bool) -> Splats:
-        if not np.abs(world).max() < FARTHEST:
-            raise BadSplats(f"{self.path}: places splats by a node beyond any measure; export it again")
+    def _sound(self, part: "_Part", logarithms: bool) -> Splats:
         scales = part.scales.astype(np.float64)
         splats = gathered(
             self.path,
@@ -178,6 +179,11 @@ class _Reader:
         )
         for note in splats.notes:
             self.notes.add(note.removeprefix(f"{self.path}: "))
+        return splats
+
+    def _placed(self, splats: Splats, world: np.ndarray) -> Splats:
+        if not np.abs(world).max() < FARTHEST:
+            raise BadSplats(f"{self.path}: places splats by a node beyond any measure; export it again")
         if splats.harmonics.shape[1] > 1 and not keeps_shapes(world[:3, :3]):
             self.notes.add("nodes stretch splats; their colours are turned as by the nearest rotation")
         return placed(splats, AXES @ world)

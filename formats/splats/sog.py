@@ -182,10 +182,10 @@ class _Reader:
 
     def splats(self) -> Splats:
         notes = [ANTIALIASED] if self.meta.model == "antialiased" else []
-        colours = self._picture(self.meta.sh0.files[0])[: self.count]
+        colours = self._rows(self.meta.sh0.files[0])
         values = self._values(self.meta.sh0, colours[:, :3])
         opacities = sigmoid(self._range(self.meta.sh0, colours, 3)) if self.old else colours[:, 3] / 255
-        scales = self._values(self.meta.scales, self._picture(self.meta.scales.files[0])[: self.count, :3])
+        scales = self._values(self.meta.scales, self._rows(self.meta.scales.files[0])[:, :3])
         scales = np.exp(scales)
         harmonics = values.astype(np.float32)[:, None]
         if self.meta.rest is not None:
@@ -195,18 +195,26 @@ class _Reader:
             f"a SOG of version {self.meta.version}",
             centres=self._centres(),
             scales=scales,
-            rotations=_rotations(self._picture(self.meta.quats.files[0])[: self.count]),
+            rotations=_rotations(self._rows(self.meta.quats.files[0])),
             opacities=opacities,
             harmonics=harmonics,
             notes=notes,
         )
 
-    def _picture(self, name: str, most: int | None = None, rows: bool = True) -> np.ndarray:
-        """(H W, 4) uint8 pixels, at least one for each splat; (H, W, 4) where not as `rows`."""
+    def _rows(self, name: str) -> np.ndarray:
+        """(N, 4) uint8, a pixel for each splat."""
+        picture = self._picture(name, max(FREE_PIXELS, PIXELS_PER_SPLAT * self.count)).reshape(-1, 4)
+        if len(picture) < self.count:
+            raise BadSplats(
+                f"{self.path}: {name[:80]} has fewer pixels than there are splats; export them again"
+            )
+        return picture[: self.count]
+
+    def _picture(self, name: str, most: int) -> np.ndarray:
+        """(H, W, 4) uint8."""
         from PIL import Image, WebPImagePlugin
 
         data, where = self.files[name], f"{self.path}: {name[:80]}"
-        most = most or max(FREE_PIXELS, PIXELS_PER_SPLAT * self.count)
         if data[:4] != b"RIFF" or data[8:12] != b"WEBP":
             raise BadSplats(f"{where} is no WebP picture; export the splats again")
         try:
@@ -214,17 +222,11 @@ class _Reader:
                 warnings.simplefilter("ignore")
                 image = WebPImagePlugin.WebPImageFile(io.BytesIO(data))
                 if image.width * image.height > most:
-                    raise LimitExceeded(
-                        f"{where} has {image.width}x{image.height} pixels, at most {most:,} are read"
-                    )
-                pixels = np.asarray(image.convert("RGBA"))
+                    size = f"{image.width}x{image.height}"
+                    raise LimitExceeded(f"{where} has {size} pixels, at most {most:,} are read")
+                return np.asarray(image.convert("RGBA"))
         except (*DECODING_ERRORS, RuntimeError, Image.DecompressionBombError) as error:
             raise BadSplats(f"{where} cannot be decoded ({error}); export the splats again") from error
-        if not rows:
-            return pixels
-        if len(pixels) * pixels.shape[1] < self.count:
-            raise BadSplats(f"{where} has fewer pixels than there are splats; export them again")
-        return pixels.reshape(-1, 4)
 
     def _values(self, values: Values, picture: np.ndarray) -> np.ndarray:
         """(N, 3) float64 that bytes stand for."""
@@ -248,7 +250,7 @@ class _Reader:
     def _centres(self) -> np.ndarray:
         """(N, 3) float64: 16 bits between bounds, of sign(x) ln(1 + |x|)."""
         means = self.meta.means
-        low, high = (self._picture(name)[: self.count, :3].astype(np.float64) for name in means.files[:2])
+        low, high = (self._rows(name)[:, :3].astype(np.float64) for name in means.files[:2])
         mins, maxs = np.array(means.mins), np.array(means.maxs)
         spans = np.where(maxs > mins, maxs - mins, 1)
         logs = mins + spans * ((low + 256 * high) / 65535)
@@ -256,7 +258,7 @@ class _Reader:
 
     def _rest(self, rest: Rest, notes: list[str]) -> np.ndarray:
         """(N, 3, 8 or 15, 3) float32 coefficients of the entries of the palette that splats have."""
-        palette = self._picture(rest.files[0], FREE_PIXELS, rows=False)
+        palette = self._picture(rest.files[0], FREE_PIXELS)
         height, width = palette.shape[:2]
         if width % PALETTE or width // PALETTE not in COEFFICIENTS:
             raise BadSplats(
@@ -268,7 +270,7 @@ class _Reader:
         else:
             book = self._book(rest.codebook)
         entries = palette.reshape(height * PALETTE, width // PALETTE, 4)[..., :3]
-        labels = self._picture(rest.files[1])[: self.count].astype(np.int64)
+        labels = self._rows(rest.files[1]).astype(np.int64)
         labels = labels[:, 0] + 256 * labels[:, 1]
         outside = labels >= len(entries)
         if outside.any():
