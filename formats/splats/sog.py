@@ -27,6 +27,8 @@ META = "meta.json"
 MAX_META = 4 << 20
 MAX_PICTURE = 1 << 29
 """Bytes of a picture as it is packed."""
+FREE_BYTES, UNPACKED = 4 << 20, 4
+"""Files of a zip may unpack to FREE_BYTES, or to so many times their own; pictures are packed already."""
 MAX_DIRECTORY = 1 << 20
 """Bytes of a zip's directory: a SOG has eight files."""
 FREE_PIXELS, PIXELS_PER_SPLAT = 1 << 22, 4
@@ -142,8 +144,11 @@ def _member(path: Path | str, pack: zipfile.ZipFile, name: str, most: int) -> by
         info = pack.getinfo(name)
     except KeyError as error:
         raise BadSplats(f"{path}: lacks the file {name[:80]!r}; copy or export it again") from error
+    most = min(most, max(FREE_BYTES, UNPACKED * info.compress_size))
     if info.file_size > most:
-        raise LimitExceeded(f"{path}: {name} has {info.file_size:,} bytes, at most {most:,} are read")
+        raise LimitExceeded(
+            f"{path}: {name[:80]} has {info.file_size:,} bytes, at most {most:,} are read of it"
+        )
     try:
         with pack.open(info) as file:
             content = file.read(info.file_size)

@@ -1,6 +1,8 @@
 """SOG: zips and folders, old and new, and what is wrong with them."""
 
+import io
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -90,6 +92,15 @@ def test_a_picture_that_is_none_or_too_large(tmp_path):
         read(tmp_path, files | {"q.webp": files["q.webp"][:-20]})
     with pytest.raises(LimitExceeded, match="3000x3000 pixels"):
         read(tmp_path, files | {"q.webp": webp(np.zeros((9_000_000, 4), np.uint8), 3000)})
+
+
+def test_a_picture_that_a_zip_unpacks_to_far_more_than_it_has(tmp_path):
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as pack:
+        for name, data in sog_files(content()).items():
+            pack.writestr(name, data + bytes(64 << 20) if name == "q.webp" else data)
+    with pytest.raises(LimitExceeded, match="q.webp has 67,"):
+        read_splats(written(tmp_path / "a.sog", out.getvalue()))
 
 
 def test_names_do_not_lead_out_of_the_folder(tmp_path):
