@@ -35,8 +35,8 @@ NEAR_ALL = 0.995
 
 class SplatsField(ComputedField):
     """N Gaussians: centres (N, 3), standard deviations `scales` (N, 3) along their own axes, which
-    `rotations` (N, 4), unit quaternions w x y z, turn to the frame's; opacities (N,) in [0, 1]; harmonics (N, K, 3), K 1,
-    4, 9 or 16, the colour seen along d being max(0, 1/2 + Σ_k Y_k(d) harmonics_k)."""
+    `rotations` (N, 4), unit quaternions w x y z, turn to the frame's; opacities (N,) in [0, 1]; harmonics
+    (N, K, 3), K 1, 4, 9 or 16, the colour seen along d being max(0, 1/2 + Σ_k Y_k(d) harmonics_k)."""
 
     kind = "splats"
     device_module = device_functions
