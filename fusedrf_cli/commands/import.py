@@ -1,0 +1,38 @@
+"""`fusedrf import`: another system's file to a bundle."""
+
+import click
+
+from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import BoxType, InputType, PositiveType, VectorType
+
+
+@click.command("import")
+@click.argument("path", metavar="FILE", type=InputType())
+@options.writing("The bundle to write, FIELD.rfpack.")
+@click.option("--name", help="Name of its node; default: that of the file.")
+@click.option(
+    "--aabb", type=BoxType(), help="Where a field lies whose file has no box, xmin,ymin,zmin,xmax,ymax,zmax."
+)
+@click.option("--near", type=PositiveType(), metavar="LENGTH", help="Or nearest to the cameras that it does,")
+@click.option("--far", type=PositiveType(), metavar="LENGTH", help="and farthest from them.")
+@click.option(
+    "--cameras", type=InputType(), metavar="CAPTURE", help="The capture it was learnt from: keep its cameras."
+)
+@click.option("--up", type=VectorType(), help="Which way of its world is up; default: as its format has it.")
+@click.option("--time", type=float, help="Take a moving scene at this time.")
+@options.imported_precision
+@options.memory
+@options.reporting
+def command(**words):
+    """Turn another system's file into a bundle of its numbers.
+
+    FILE is a checkpoint of TensoRF, Plenoxels (svox2), DVGO, Instant-NGP, NeRF (nerf-pytorch),
+    torch-ngp, PVD or nerfacto, or the folder of a run, whose newest checkpoint is taken; or Gaussian
+    splats: .ply, .spz, .sog, .splat, .ksplat or glTF. Files are told apart by what they hold.
+    Nothing in them is run, and nothing is learnt.
+
+    \b
+    Example:
+      fusedrf import lego.th -o lego.rfpack
+    """
+    return verbs.import_field(**words)
