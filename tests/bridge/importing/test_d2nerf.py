@@ -250,7 +250,7 @@ def test_static_and_dynamic_fields_answer_by_d2nerfs_formulas(model, time, tmp_p
     lit = expected["rgb_static"] * (1 - expected["shadow"])[:, None]
     np.testing.assert_allclose(static[1], lit, atol=1e-4)
     np.testing.assert_allclose(dynamic[1], expected["rgb_dynamic"], atol=1e-4)
-    assert imported.rule == "add" and [node.suffix for node in imported.nodes] == ["static", "dynamic"]
+    assert imported.rule == "add" and [node.suffix for node in imported.nodes] == ["-static", "-dynamic"]
     assert any("shadow" in note for note in imported.notes) == bool(model.shadow)
 
 
