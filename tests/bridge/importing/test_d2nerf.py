@@ -12,6 +12,7 @@ from scipy.linalg import expm
 from formats.errors import FormatError
 from formats.foreign.systems import open_checkpoint
 from fusedrf_cli.bridge.importing import d2nerf
+from tests.bridge.importing.test_k_planes import stored
 from tests.formats.foreign.samples import flax_array
 
 BOX = np.array([-1.5, -1.0, -1.0, 1.0, 1.5, 2.0])
@@ -233,7 +234,7 @@ def samples(count: int = 60) -> tuple[np.ndarray, np.ndarray]:
 
 
 def asked(node, points, dirs) -> tuple[np.ndarray, np.ndarray]:
-    field = node.field
+    field = stored(node.field)
     found = field.answers(field.params, torch.from_numpy(points), torch.from_numpy(dirs))
     return tuple(value.numpy() for value in found)
 

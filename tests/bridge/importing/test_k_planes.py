@@ -9,7 +9,9 @@ import torch
 
 from formats.errors import FormatError
 from formats.foreign.systems import open_checkpoint
+from formats.records import FieldRecord, decode_field, encode_field
 from fusedrf_cli.bridge.importing import k_planes
+from fusedrf_cli.bridge.scene import make_field
 
 
 @dataclass(frozen=True)
@@ -176,9 +178,16 @@ def assert_answers(imported, points: np.ndarray, dirs: np.ndarray, sigma, rgb) -
     v = dirs @ world_to_object[:3, :3].T
     length = np.linalg.norm(v, axis=1)
     x = points @ world_to_object[:3, :3].T + world_to_object[:3, 3]
-    found = node.field.answers(node.field.params, torch.from_numpy(x), torch.from_numpy(v / length[:, None]))
+    field = stored(node.field)
+    found = field.answers(field.params, torch.from_numpy(x), torch.from_numpy(v / length[:, None]))
     np.testing.assert_allclose(found[0].numpy() * length, sigma, rtol=1e-4)
     np.testing.assert_allclose(found[1].numpy()[sigma > 0], rgb[sigma > 0], atol=1e-4)
+
+
+def stored(field):
+    """The field that a bundle gives back."""
+    record = FieldRecord(field.kind, *field.state())
+    return make_field(decode_field(encode_field(record, "float32"), "here"), "here")
 
 
 def samples(model: Model) -> tuple[np.ndarray, np.ndarray]:
