@@ -98,7 +98,7 @@ def ray_backward(field, d, scratch, grad):
     d_basis = np.uint64(AT + D_BASIS)
     network_backward(
         INPUTS, HIDDEN, LAYERS, 0, OUTPUTS, field.params, field.layers, scratch, np.uint64(AT + DIRECTION),
-        np.uint64(AT + H), d_basis, np.uint64(AT + D_H), np.uint64(AT + D_BEFORE),
+        np.uint64(AT + H), scratch, d_basis, np.uint64(AT + D_H), np.uint64(AT + D_BEFORE),
         np.uint64(AT + D_DIRECTION), grad,
     )  # fmt: skip
     for r in range(np.uint64(OUTPUTS)):
