@@ -12,6 +12,8 @@ import torch
 from formats.errors import FormatError
 from fusedrf_cli.engine.decoders import mlp
 from fusedrf_cli.engine.decoders.sh_mlp import HARMONICS
+from fusedrf_cli.engine.fields.base import check_samples, sampling_step
+from fusedrf_cli.engine.fields.box import checked_box, whole_numbers
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsField, PartsShape
 
@@ -97,12 +99,19 @@ class Entries:
 
     def layers(self, prefix: str) -> list[Layer]:
         """The dense layers of a network whose names begin so: `<prefix><numbers>.weight` and, if there are
-        any, `.bias`, in the order of their numbers: 0, 2.0, 3."""
+        any, `.bias`, in the order of their numbers: 0, 1, 2; with activations between them 0, 2, 4; or, where
+        they are nested as DVGO's, 0, 2.0, 3."""
         found = re.compile(re.escape(prefix) + r"(\d{1,3}(?:\.\d{1,3})*)\.weight")
         middles = [match[1] for name in self.values if (match := found.fullmatch(str(name)))]
         if not middles:
             raise FormatError(f"{self.where}'{prefix}0.weight' is missing")
         ordered = sorted(middles, key=lambda middle: [int(n) for n in middle.split(".")])
+        numbers, count = [int(middle.split(".")[0]) for middle in ordered], len(ordered)
+        nested = any("." in middle for middle in ordered)
+        if numbers not in (
+            list(range(count)), list(range(0, 2 * count, 2)), [0, *range(2, count + 1)] if nested else [],
+        ):  # fmt: skip
+            raise FormatError(f"{self.where}'{prefix}*' has layers {', '.join(ordered)}: one is missing")
         return [self.layer(prefix + middle) for middle in ordered]
 
     def layer(self, name: str) -> Layer:
@@ -124,9 +133,15 @@ def parts_field(
     shift: float = 0.0,
     occupancy: OccupancyGrid | None = None,
 ) -> PartsField:
-    """A field of these numbers by the names of its sections; where one has fewer, the others are 0."""
-    resolution = tuple(int(n) for n in resolution)
-    field = PartsField(shape, np.asarray(box, np.float64), resolution, scale, shift, occupancy=occupancy)
+    """A field of these numbers by the names of its sections; where one has fewer, the others are 0. Raises
+    ValueError for what a bundle may not say either."""
+    resolution = whole_numbers([int(n) for n in resolution], 2, "texels per axis")
+    if not (0 < scale < np.inf and np.isfinite(shift)):
+        raise FormatError(
+            f"the density's scale should be above 0 and its shift finite, found {scale}, {shift}"
+        )
+    field = PartsField(shape, checked_box([*box], "the box"), resolution, scale, shift, occupancy=occupancy)
+    check_samples(field.occupancy.most_samples(sampling_step(field)), "the field")
     sections = field.sections()
     if values.keys() != sections.keys():
         raise ValueError(f"the sections are {sorted(sections)}, found {sorted(values)}")
