@@ -27,7 +27,7 @@ def command(**words):
     """Turn another system's file into a bundle that answers exactly as it does.
 
     FILE is a checkpoint of TensoRF, Plenoxels (svox2), DVGO, Instant-NGP, NeRF (nerf-pytorch),
-    torch-ngp, PVD or nerfacto, or the folder of a run, whose newest checkpoint is taken; or Gaussian
+    HashNeRF, torch-ngp, PVD or nerfacto, or the folder of a run, whose newest checkpoint is taken; or Gaussian
     splats: .ply, .spz, .sog, .splat, .ksplat or glTF. Files are told apart by what they hold.
     Nothing in them is run, and nothing is learnt.
 

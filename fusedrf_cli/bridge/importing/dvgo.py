@@ -38,7 +38,7 @@ def read(checkpoint) -> Imported:
     kwargs, state = entries.inside("model_kwargs"), entries.inside("model_state_dict")
     check_version(kwargs, state)
     box = np.concatenate([bounds(state, kwargs, name) for name in ("xyz_min", "xyz_max")])
-    box = checked_box([*box], "the box from 'xyz_min' to 'xyz_max'")
+    box = checked_box(box.tolist(), "the box from 'xyz_min' to 'xyz_max'")
     density, values, resolution, _ = grid_of(state, "density")
     colour, more, colour_resolution, basis = grid_of(state, "k0")
     if resolution != colour_resolution:
@@ -70,9 +70,9 @@ def check_version(kwargs: Entries, state: Entries) -> None:
 
 
 def shift_of(kwargs: Entries, state: Entries) -> float:
-    """What is added to a density before its activation: the first version has it from the opacity that
+    """What is added to a density before its activation: earlier versions have it from the opacity that
     training began with."""
-    if "act_shift" in state.values or "alpha_init" not in kwargs.values:
+    if "act_shift" in state.values or "density" not in state.values:
         return state.number("act_shift")
     begun = kwargs.number("alpha_init")
     if not 0 < begun < 1:
@@ -130,7 +130,10 @@ def shading_of(
         return {"part": "sh_basis", "coefficients": 1}, {"rgb_basis": basis[:, None] / Y0}
     frequencies = kwargs.whole("viewbase_pe", 0, 16, 4)
     if "viewfreq" in state.values:
-        frequencies = len(state.array("viewfreq", None))
+        bands = state.array("viewfreq", None)
+        frequencies = len(bands)
+        if not np.array_equal(bands, 2.0 ** np.arange(frequencies)):
+            raise FormatError(f"'viewfreq' should be 1, 2, 4 and so on, found {bands.tolist()[:9]}")
     layers = state.layers("rgbnet.")
     # not all versions say whether the first three features are diffuse; the first layer's width does
     direct = layers[0][0].shape[1] == count + 3 + 6 * frequencies
@@ -145,13 +148,13 @@ def shading_of(
 def space_and_placement(kwargs: Entries, state: Entries, box: np.ndarray):
     """The space that the grid lies in, its frame's placement (4, 4), and what is to be said: of contracted
     scenes the cube that is not contracted is the frame's unit."""
-    if "scene_center" not in state.values:
+    if {"scene_center", "scene_radius"}.isdisjoint(state.values):
         return bounded, np.eye(4), []
-    norm = kwargs.values.get("contracted_norm", "inf")
+    norm = str(kwargs.values.get("contracted_norm", "inf"))
     notes = [] if "contracted_norm" in kwargs.values else [NORM]
     spaces = {"inf": contracted_linf, "l2": contracted_l2}
     if norm not in spaces:
-        raise FormatError(f"model_kwargs: 'contracted_norm' should be inf or l2, found {str(norm)[:40]!r}")
+        raise FormatError(f"model_kwargs: 'contracted_norm' should be inf or l2, found {norm[:40]!r}")
     shell = box[3] - 1
     if not 0 < shell <= 1 or not np.allclose(np.abs(box), box[3]):
         raise FormatError(
@@ -171,7 +174,7 @@ def cells_of(state: Entries, box: np.ndarray, space) -> tuple[OccupancyGrid, lis
     if "nonempty_mask" in state.values:
         held = state.array("nonempty_mask", 1, 1, None, None, None)[0, 0] > 0
         return OccupancyGrid(box, between(held)), [MASK]
-    if "mask_cache.mask" not in state.values:
+    if {"mask_cache.mask", "mask_cache.xyz2ijk_scale"}.isdisjoint(state.values):
         return OccupancyGrid.full(box, space=space), []
     mask = state.array("mask_cache.mask", None, None, None) > 0
     scale, shift = (state.array(f"mask_cache.xyz2ijk_{n}", 3).astype(np.float64) for n in ("scale", "shift"))

@@ -40,6 +40,7 @@ def read(checkpoint, box: np.ndarray) -> Imported:
     """The fine network of a checkpoint of nerf-pytorch, or the only one, in a box (6,). Raises
     FormatError."""
     state, notes = network_of(checkpoint, "network_fn_state_dict", "network_fine_state_dict")
+    check_biases(state)
     layers = state.layers("pts_linears.")
     encoding = encoding_of(layers[0][0].shape[1])
     if "output_linear.weight" in state.values:
@@ -60,6 +61,7 @@ def read_krrish(checkpoint, box: np.ndarray) -> Imported:
     encodings may leave out the point and the direction themselves."""
     check_sampling(checkpoint)
     state, notes = network_of(checkpoint, "model_coarse_state_dict", "model_fine_state_dict")
+    check_biases(state)
     first, layers = state.layer("layer1"), state.layers("layers_xyz.")
     inputs, hidden = first[0].shape[1], len(layers[-1][0])
     layers[0] = joined(first, layers[0])  # the first has no activation
@@ -72,6 +74,7 @@ def read_krrish(checkpoint, box: np.ndarray) -> Imported:
     out = stacked(state.layer("fc_alpha"), (np.eye(hidden), None))
     sigma, sections = skipping([*layers, out], encoding["count"], hidden_first=True)
     (feature, bias), (weight, own), *others = state.layer("fc_feat"), *state.layers("layers_dir.")
+    check_layers([(feature, bias), (weight[:, : len(feature)], own)], hidden)
     count, directions = len(feature), weight.shape[1] - len(feature)
     order, columns = seen(sigma["outputs"], hidden, directions)
     # A direction e passes a rectified layer as max(0, e) and max(0, -e).
@@ -93,7 +96,7 @@ def read_hashed(checkpoint, box: np.ndarray) -> Imported:
     """The same of HashNeRF's small networks, which read a hash grid over the box."""
     state, notes = network_of(checkpoint, "network_fn_state_dict", "network_fine_state_dict")
     tables = Entries(checkpoint.entries).inside("embed_fn_state_dict")
-    names = [f"embeddings.{level}.weight" for level in range(len(tables.values))]
+    names = [f"embeddings.{level}.weight" for level in range(max(len(tables.values), 1))]
     first = tables.array(names[0], None, None)
     rows = np.concatenate([tables.array(name, *first.shape) for name in names])
     settings = Entries(checkpoint.beside.get("args.txt", {}))
@@ -144,6 +147,13 @@ def network_of(checkpoint, coarse: str, fine: str) -> tuple[Entries, list[str]]:
     if no_ndc is False and args.get("dataset_type", "llff") == "llff":
         notes.append(NDC)
     return entries.inside(fine if entries.values.get(fine) else coarse), notes
+
+
+def check_biases(state: Entries) -> None:
+    """Raise FormatError where a layer has no bias."""
+    for name in state.values:
+        if str(name).endswith(".weight"):
+            state.get(f"{str(name).removesuffix('weight')}bias")
 
 
 def check_sampling(checkpoint) -> None:
@@ -228,6 +238,9 @@ def with_point(layers: Sequence[Layer], inputs: int) -> list[Layer]:
 
 def stacked(*layers: Layer) -> Layer:
     """Layers that read the same, as one."""
+    if len({weight.shape[1] for weight, _ in layers}) > 1:
+        found = " and ".join(str(weight.shape[1]) for weight, _ in layers)
+        raise FormatError(f"layers behind the same one should read as many numbers, found {found}")
     weights = np.concatenate([weight for weight, _ in layers])
     biases = [np.zeros(len(weight)) if bias is None else bias for weight, bias in layers]
     return weights, np.concatenate(biases)

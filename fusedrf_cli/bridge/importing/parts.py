@@ -112,7 +112,10 @@ class Entries:
             list(range(count)), list(range(0, 2 * count, 2)), [0, *range(2, count + 1)] if nested else [],
         ):  # fmt: skip
             raise FormatError(f"{self.where}'{prefix}*' has layers {', '.join(ordered)}: one is missing")
-        return [self.layer(prefix + middle) for middle in ordered]
+        layers = [self.layer(prefix + middle) for middle in ordered]
+        if len({bias is None for _, bias in layers}) > 1:
+            raise FormatError(f"{self.where}'{prefix}*' has biases of some layers only: one is missing")
+        return layers
 
     def layer(self, name: str) -> Layer:
         """One dense layer."""
@@ -140,7 +143,9 @@ def parts_field(
         raise FormatError(
             f"the density's scale should be above 0 and its shift finite, found {scale}, {shift}"
         )
-    field = PartsField(shape, checked_box([*box], "the box"), resolution, scale, shift, occupancy=occupancy)
+    field = PartsField(
+        shape, checked_box(np.asarray(box).tolist(), "the box"), resolution, scale, shift, occupancy=occupancy
+    )
     check_samples(field.occupancy.most_samples(sampling_step(field)), "the field")
     sections = field.sections()
     if values.keys() != sections.keys():

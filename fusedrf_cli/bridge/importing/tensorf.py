@@ -52,8 +52,8 @@ def read(checkpoint) -> Imported:
     shift = kwargs.number("density_shift", -10.0) if act == "softplus" else 0.0
     scale = kwargs.number("distance_scale", 25.0)
     field = parts_field(shape, box, resolution, values, scale, shift, cells_of(entries, box))
-    near_far = kwargs.values.get("near_far")
-    return Imported([ImportedNode(field)], [NDC] if near_far is not None and [*near_far] == [0, 1] else [])
+    in_ndc = kwargs.values.get("near_far") in ([0, 1], (0, 1))
+    return Imported([ImportedNode(field)], [NDC] if in_ndc else [])
 
 
 def split(state: Entries, kwargs: Entries) -> Entries:
@@ -132,9 +132,9 @@ def shading_of(kwargs: Entries, state: Entries, basis: np.ndarray) -> tuple[dict
 
 def cells_of(entries: Entries, box: np.ndarray) -> OccupancyGrid:
     """The alpha mask: a point counts where any of the eight samples around it is occupied."""
-    if "alphaMask.shape" not in entries.values:
+    if {"alphaMask.shape", "alphaMask.mask", "alphaMask.aabb"}.isdisjoint(entries.values):
         return OccupancyGrid.full(box)
-    shape = [int(n) for n in np.asarray(entries.get("alphaMask.shape")).reshape(-1)][-3:]
+    shape = [int(n) for n in entries.array("alphaMask.shape", None)[-3:]]
     bits = entries.get("alphaMask.mask")
     bits = bits.array() if hasattr(bits, "array") else np.asarray(bits)
     if (
@@ -150,7 +150,7 @@ def cells_of(entries: Entries, box: np.ndarray) -> OccupancyGrid:
         # samples around those of the mask are 0, and a point may lie between the two
         samples, cell = np.pad(samples, 1), (mask_box[1] - mask_box[0]) / (np.array(samples.shape) - 1)
         mask_box = mask_box + [-cell, cell]
-    return OccupancyGrid(checked_box([*mask_box.reshape(6)], "'alphaMask.aabb'"), between(samples))
+    return OccupancyGrid(checked_box(mask_box.reshape(6).tolist(), "'alphaMask.aabb'"), between(samples))
 
 
 def between(samples: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
+from formats.errors import FormatError
 from formats.foreign.systems import open_checkpoint
 from fusedrf_cli.bridge.importing import dvgo
 from fusedrf_cli.main import cli
@@ -297,28 +298,22 @@ def with_nan(held: dict) -> None:
     held["model_state_dict"]["k0.grid"][0, 0, 0, 0, 0] = np.nan
 
 
-def without_shift(**kwargs):
-    def change(held: dict) -> None:
-        held["model_state_dict"].pop("act_shift")
-        held["model_kwargs"].pop("alpha_init")
-        held["model_kwargs"].update(kwargs)
-
-    return change
-
-
 def without_network(held: dict) -> None:
     for name in [name for name in held["model_state_dict"] if name.startswith("rgbnet")]:
         without(name)(held)
 
 
 BROKEN = {
-    "no shift": (without_shift(), "'act_shift' is missing"),
-    "a wrong opacity": (without_shift(alpha_init=1.0), "'alpha_init' should be between 0 and 1"),
+    "no shift": (without("act_shift"), "'act_shift' is missing"),
     "grids that differ": (in_state(k0__grid=torch.zeros(1, 12, 7, 5, 8)), "grids of density and colour are"),
     "two densities": (in_state(density__grid=torch.zeros(1, 2, 7, 5, 9)), "have one number at a vertex, fou"),
     "four axes": (in_state(density__grid=torch.zeros(1, 7, 5, 9)), "'density.grid' should have shape"),
     "fewer channels": (in_state(k0__grid=torch.zeros(1, 11, 7, 5, 9)), "should read 35 numbers, found 39"),
-    "other frequencies": (in_state(viewfreq=torch.ones(3)), "should read 30 numbers, found 39"),
+    "odd frequencies": (in_state(viewfreq=torch.ones(4)), "'viewfreq' should be 1, 2, 4 and so on"),
+    "no bias": (without("rgbnet.2.0.bias"), "biases of some layers only"),
+    "no mask": (without("mask_cache.mask"), "'mask_cache.mask' is missing"),
+    "no centre": (in_state(scene_radius=torch.ones(3)), "a cube up to 1 to 2"),
+    "other frequencies": (in_state(viewfreq=2 ** torch.arange(3)), "should read 30 numbers, found 39"),
     "no middle layer": (without("rgbnet.2.0.weight"), "layers 0, 3: one is missing"),
     "no last layer": (without("rgbnet.3.weight"), "should make 3 numbers, found 16"),
     "no network": (without_network, "3 numbers at a vertex without 'rgbnet', found 12"),
@@ -353,3 +348,9 @@ def test_what_is_wrong_with_a_contracted_scene_is_named(name, value, said, tmp_p
     path = saved(MODELS["contracted"], tmp_path, in_state(**{name: value}))
     result = CliRunner().invoke(cli, ["import", str(path), "-o", str(tmp_path / "a.rfpack")])
     assert result.exit_code == 3 and said in result.output, result.output
+
+
+def test_an_opacity_that_is_none_is_named(tmp_path):
+    path = saved(MODELS["without classes"], tmp_path, in_kwargs(alpha_init=1.0))
+    with pytest.raises(FormatError, match="'alpha_init' should be between 0 and 1, found 1"):
+        dvgo.read(open_checkpoint(path))

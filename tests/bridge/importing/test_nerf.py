@@ -463,8 +463,13 @@ BROKEN = {
     "a first layer less": (without("pts_linears.0.weight"), "layers 1, 2, 3: one is missing"),
     "another width": (with_shape("pts_linears.1.weight", 16, 15), "should read 16 numbers, found 15"),
     "no frequencies": (with_shape("pts_linears.0.weight", 16, 14), "6 for each frequency, found 14"),
+    "features of another width": (
+        with_shape("feature_linear.weight", 16, 12),
+        "read as many numbers, found 16 ",
+    ),
     "a vector": (with_shape("pts_linears.0.weight", 16), "should have shape"),
     "another bias": (with_shape("pts_linears.0.bias", 15), r"should have shape \[16\], found \[15\]"),
+    "no bias": (without("feature_linear.bias"), "'feature_linear.bias' is missing"),
     "two densities": (with_shape("alpha_linear.weight", 2, 16), "shape"),
     "four colours": (with_shape("rgb_linear.weight", 4, 8), "shape|3 numbers"),
     "NaN": (with_nan("pts_linears.0.bias"), "'pts_linears.0.bias' holds NaN"),

@@ -302,6 +302,8 @@ BROKEN = {
     "no distance": (in_kwargs(distance_scale=0), "scale should be above 0"),
     "NaN": (with_nan, "'app_plane.1' holds NaN"),
     "a mask of less": (lambda held: held.update({"alphaMask.shape": (1, 1, 50, 60, 40)}), "bits of a grid"),
+    "a mask of no shape": (lambda held: held.pop("alphaMask.shape"), "'alphaMask.shape' is missing"),
+    "no bias": (without("renderModule.mlp.2.bias"), "biases of some layers only"),
     "a mask of no box": (lambda held: held.pop("alphaMask.aabb"), "'alphaMask.aabb' is missing"),
     "a mask of no bits": (lambda held: held.pop("alphaMask.mask"), "'alphaMask.mask' is missing"),
 }
