@@ -26,8 +26,8 @@ from fusedrf_cli.option_types import BoxType, InputType, PositiveType, VectorTyp
 def command(**words):
     """Turn another system's file into a bundle of its numbers.
 
-    FILE is a checkpoint of TensoRF, Plenoxels (svox2), DVGO, Instant-NGP, NeRF (nerf-pytorch),
-    HashNeRF, torch-ngp, PVD or nerfacto, or the folder of a run, whose newest checkpoint is taken; or Gaussian
+    FILE is a checkpoint of TensoRF, Plenoxels (svox2), DVGO, Instant-NGP, NeRF (nerf-pytorch), HashNeRF,
+    torch-ngp, PVD or nerfacto, or the folder of a run, whose newest checkpoint is taken; or Gaussian
     splats: .ply, .spz, .sog, .splat, .ksplat or glTF. Files are told apart by what they hold.
     Nothing in them is run, and nothing is learnt.
 
