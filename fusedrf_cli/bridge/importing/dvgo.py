@@ -138,7 +138,7 @@ def shading_of(
     # not all versions say whether the first three features are diffuse; the first layer's width does
     direct = layers[0][0].shape[1] == count + 3 + 6 * frequencies
     rows = count if basis is not None else 0
-    order = ColourInput(count, rows or eight(count), frequencies)
+    order = ColourInput(count, rows or eight(count), frequencies, alone=True)
     read = order.at("features")[0 if direct else 3 :]
     columns = np.concatenate([read, order.at("direction"), order.waves("direction", frequencies)])
     entry, sections = colour_network(layers, order, columns, rows=rows, diffuse=not direct)

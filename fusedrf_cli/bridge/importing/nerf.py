@@ -220,7 +220,7 @@ def seen(width: int, features: int, directions: int) -> tuple[ColourInput, np.nd
         return order, order.at("direction")
     bare = directions % 6 == 0
     frequencies = frequencies_of(directions + 3 * bare)
-    order = ColourInput(1 + features, width, frequencies)
+    order = ColourInput(1 + features, width, frequencies, alone=True)
     waves = order.waves("direction", frequencies, by_level=True)
     return order, waves if bare else np.concatenate([order.at("direction"), waves])
 

@@ -188,10 +188,18 @@ class ColourInput:
     frequencies: int = 0
     harmonics: bool = False
     point: bool = False
+    alone: bool = False
+    """Whether only the direction is encoded by frequencies."""
 
     @property
     def core(self) -> int:
-        return self.width + (HARMONICS if self.harmonics else 3) + 3 * self.point
+        waves = 6 * self.frequencies * self.alone
+        return self.width + (HARMONICS if self.harmonics else 3) + waves + 3 * self.point
+
+    @property
+    def direction(self) -> str:
+        """As the network's options have it."""
+        return "harmonics" if self.harmonics else ("waves" if self.alone else "raw")
 
     def at(self, which: str) -> np.ndarray:
         """The rows of the features, the direction or the point."""
@@ -205,8 +213,9 @@ class ColourInput:
         """The rows of sines and cosines of the features, the direction or the point: all sines, dimension by
         dimension, then all cosines; or by_level, sines and cosines of all dimensions for each level."""
         dims, levels = self.at(which)[:, None], np.arange(frequencies)[None]
-        sines = dims + self.core * (1 + levels)
-        cosines = dims + self.core * (1 + self.frequencies + levels)
+        apart = 3 if self.alone else self.core
+        sines = dims + apart * (1 + levels)
+        cosines = dims + apart * (1 + self.frequencies + levels)
         if by_level:
             return np.stack([sines, cosines], 1).transpose(2, 1, 0).reshape(-1)
         return np.concatenate([sines.reshape(-1), cosines.reshape(-1)])
@@ -224,7 +233,7 @@ def colour_network(
     hidden = check_layers(layers, len(columns), 3)
     entry = {
         "part": "mlp", "rows": rows, "hidden": hidden, "layers": len(layers) - 1,
-        "frequencies": order.frequencies, "direction": "harmonics" if order.harmonics else "raw",
+        "frequencies": order.frequencies, "direction": order.direction,
         "point": order.point, "diffuse": diffuse,
     }  # fmt: skip
     inputs = mlp.layer_shapes(order.width, 0, hidden, len(layers) - 1, order.frequencies, entry["direction"],

@@ -115,7 +115,8 @@ def shading_of(kwargs: Entries, state: Entries, basis: np.ndarray) -> tuple[dict
     view = kwargs.whole("view_pe", 0, MAX_FREQUENCIES, 6)
     features = kwargs.whole("fea_pe", 0, MAX_FREQUENCIES, 6) if mode == "MLP_Fea" else 0
     points = kwargs.whole("pos_pe", 0, MAX_FREQUENCIES, 6) if mode == "MLP_PE" else 0
-    order = ColourInput(count, count, max(view, features, points), point=mode == "MLP_PE")
+    frequencies, alone = max(view, features, points), not features and not points
+    order = ColourInput(count, count, frequencies, point=mode == "MLP_PE", alone=alone)
     layers = state.layers("renderModule.mlp.")
     columns = [order.at("features"), order.at("direction")]
     if mode == "MLP_PE":

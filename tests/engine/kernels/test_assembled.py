@@ -65,6 +65,9 @@ COLOURS = {
     "mlp_of_harmonics": lambda width: (
         mlp, {"width": width, "rows": 0, "hidden": 8, "frequencies": 0, "direction": "harmonics"}
     ),
+    "mlp_of_waves": lambda width: (
+        mlp, {"width": width, "rows": 0, "hidden": 8, "frequencies": 4, "direction": "waves", "point": True}
+    ),
     "mlp_of_points": lambda width: (
         mlp, {"width": width, "rows": 4, "hidden": 8, "layers": 1, "point": True, "limits": (-0.5, 0.5)}
     ),
