@@ -1,10 +1,10 @@
 """Imports against the answers of the systems that wrote them: python -m benchmarks.foreign DATA [NAME ..]
 
-DATA is a folder with a folder for each checkpoint, in which answers.npz has points, directions, σ and colours by
-the system's own code, and view.npz and view.json a picture by its own renderer. Each file is imported as
-`fusedrf import` does it. Prints a Markdown table: the relative error of σ where it is above 0, and the largest of
-a colour's, as median and 99 %; the share of the points without density where ours is 0 as well; the PSNR of the
-picture, at half a voxel's step and at a quarter of that.
+DATA is a folder with a folder for each checkpoint, in which answers.npz has points, directions, σ and colours
+by the system's own code, and view.npz and view.json a picture by its own renderer. Each file is imported as
+`fusedrf import` does it. Prints a Markdown table: the relative error of σ where it is above 0, and the largest
+of a colour's, as median and 99 %; the share of the points without density where ours is 0 as well; the PSNR of
+the picture, at half a voxel's step and at a quarter of that.
 """
 
 import argparse
@@ -71,10 +71,8 @@ def measured(folder: Path, bundle: Path) -> dict:
     colour, empty = np.abs(rgb - answers["rgb"])[dense].max(1), truth == 0
     row = {"file": folder.name}
     for name, values in (("σ", off), ("colour", colour)):
-        row |= {
-            f"{name}, median": f"{np.median(values):.1e}",
-            "99 %" + f" of {name}": f"{np.quantile(values, 0.99):.1e}",
-        }
+        row[f"{name}, median"] = f"{np.median(values):.1e}"
+        row[f"99 % of {name}"] = f"{np.quantile(values, 0.99):.1e}"
     row["empty"] = f"{(sigma[empty] == 0).mean():.4f}" if empty.any() else ""
     return row | pictures(folder, bundle, "_capture" if where else "")
 
