@@ -28,7 +28,7 @@ def cells_of_bits(bits: np.ndarray, bound: float) -> list[OccupancyGrid]:
     side = round((len(bits) / cascades) ** (1 / 3))
     if side < 2 or side & (side - 1) or side**3 * cascades != len(bits):
         raise FormatError(
-            f"{len(bits):,} cells are no {cascades} cubes of a power of two, which a bound of {bound:g} asks for"
+            f"{len(bits):,} cells are no {cascades} cubes of a power of two, as a bound of {bound:g} asks for"
         )
     return grids_of(unmortoned(bits.reshape(cascades, -1), side), np.zeros(3), bound)
 
