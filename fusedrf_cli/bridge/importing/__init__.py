@@ -14,14 +14,13 @@ from formats.errors import FormatError
 from formats.foreign.stored import StoredTensor
 from formats.foreign.systems import SYSTEMS, Checkpoint, open_checkpoint
 from formats.graph import free_name, placement_of
-from formats.nodes import Node, make_node
 from formats.records import FieldRecord
-from formats.scene import SceneGraph
+from formats.scene import SceneGraph, make_node
 from formats.splats.reading import is_splats
 from formats.views import Capture
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.importing import splats
-from fusedrf_cli.bridge.importing.parts import Imported, ImportedNode
+from fusedrf_cli.bridge.importing.parts import Imported
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.spaces import bounded
@@ -128,32 +127,21 @@ def box_of(request: ImportRequest, capture: Capture | None) -> np.ndarray:
     return np.concatenate([corners.min(0), corners.max(0)])
 
 
-def added(
-    writer: BundleWriter, node: ImportedNode, names: set[str], wanted: str, precision: str,
-    world_to_group: np.ndarray | None = None,
-) -> Node:  # fmt: skip
-    """A node of an import, whose field the writer has now; world_to_group: of what it stands in."""
-    member = writer.add_field(FieldRecord(node.field.kind, *node.field.state()), precision)
-    placed = node.object_to_world if world_to_group is None else world_to_group @ node.object_to_world
-    return make_node(free_name(wanted + node.suffix, names), field=member, **placement_of(placed))
-
-
 def write(
     imported: Imported, request: ImportRequest, capture: Capture | None, up: tuple[float, ...] | None
 ) -> SceneGraph:
-    """Write the bundle; its scene graph. up: which way is up in its world, where that is known."""
-    writer, names = BundleWriter(), set()
+    """Write the bundle; its scene graph: several nodes stand in a group. up: which way is up in its world,
+    where that is known."""
+    writer, nodes, names = BundleWriter(), [], set()
     wanted = request.name or Path(request.path).stem
-    crop, frame = (None, np.eye(4)) if imported.crop is None else imported.crop
-    showing = {} if crop is None else {"crop": crop.tolist()}
-    first, *others = imported.nodes
-    if others or crop is not None and not np.array_equal(frame, first.object_to_world):
-        name, back = free_name(wanted, names), np.linalg.inv(frame)
-        nodes = [added(writer, node, names, wanted, request.precision, back) for node in imported.nodes]
-        group = make_node(name, children=tuple(nodes), showing=showing, **placement_of(frame))
-        nodes = [group if imported.rule == "max" else replace(group, composition=imported.rule)]
-    else:
-        nodes = [replace(added(writer, first, names, wanted, request.precision), showing=showing)]
+    group = free_name(wanted, names) if len(imported.nodes) > 1 else None
+    for node in imported.nodes:
+        member = writer.add_field(FieldRecord(node.field.kind, *node.field.state()), request.precision)
+        name = free_name(wanted + node.suffix, names)
+        nodes.append(make_node(name, field=member, **placement_of(node.object_to_world)))
+    if group is not None:
+        rule = None if imported.rule == "max" else imported.rule
+        nodes = [replace(make_node(group, children=tuple(nodes)), composition=rule)]
     cameras = None
     if capture is not None:
         unbounded = any(node.field.space is not bounded for node in imported.nodes)

@@ -3,21 +3,26 @@ or fewer, each twice as large as the one before, in Morton order; at a point the
 it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from formats.errors import FormatError
 from fusedrf_cli.bridge.importing.parts import ImportedNode
 from fusedrf_cli.engine.fields.box import MAX_TEXELS
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, transformed_aabb
 from fusedrf_cli.engine.kinds.assembled.field import PartsField
+from fusedrf_cli.engine.spaces.bounded import STEP_PER_VOXEL
 
-SAMPLES = 297
-"""Vertices along an axis of the first cascade by which rays are sampled as there, a 1024th of its diagonal
-apart."""
+SAMPLED = 3**0.5 / 1024
+"""How far apart rays are sampled in the first cascade, of its side, and in others of twice that, and so on;
+there it is so at least, and more where the camera is far."""
 
 TOGETHER = 2
 """Cascades that become one grid: of cells of the finest, eight times as many as a cascade has."""
+IDENTITY = np.eye(3)
+MOST_CELLS = 1 << 22
+"""That a grid is cut into by a box."""
 MOST_PARTS = 4
 """Parts along an axis of a cell of a last cascade that is not twice as large as the one before."""
 
@@ -66,7 +71,8 @@ def grids_of(
         if group[0]:
             emptied(occupied, 2.0 ** (group[0] - 1) / half)
         box = np.concatenate([middle - half * unit, middle + half * unit])
-        grids.append(OccupancyGrid(box, occupied))
+        apart = SAMPLED * 2.0 ** group[0] * 2 * unit * min(1.0, bound)
+        grids.append(OccupancyGrid(box, occupied, unit=apart))
     return grids
 
 
@@ -97,20 +103,60 @@ def emptied(occupied: np.ndarray, share: float) -> None:
     occupied[inner, inner, inner] = False
 
 
+def cropped(
+    grids: Sequence[OccupancyGrid], box: np.ndarray, to_local: np.ndarray = IDENTITY
+) -> list[OccupancyGrid]:
+    """The grids without the cells outside of a box (6,) of a frame that a matrix (3, 3) takes points to. The
+    box's faces are met as well as MOST_CELLS cells do; those of a grid that is occupied all over exactly,
+    where the frame is not turned."""
+    made = []
+    for grid in grids:
+        low, high = transformed_aabb(grid.aabb, framed(to_local)).reshape(2, 3)
+        if (box[:3] <= low).all() and (box[3:] >= high).all() or not grid.occupied.any():
+            made.append(grid)
+            continue
+        if grid.occupied.all() and np.array_equal(to_local, IDENTITY):
+            inner = np.concatenate([np.maximum(low, box[:3]), np.minimum(high, box[3:])])
+            if (inner[:3] < inner[3:]).all():
+                made.append(replace(OccupancyGrid.full(inner), unit=grid.unit))
+            continue
+        tight = grid.within(grid.tight_aabb(0))
+        parts = max(1, int((MOST_CELLS / tight.occupied.size) ** (1 / 3) + 1e-9))
+        finer = replace(tight, occupied=tight.occupied.repeat(parts, 0).repeat(parts, 1).repeat(parts, 2))
+        x, y, z = (
+            low + (np.arange(n) + 0.5) * cell
+            for low, n, cell in zip(finer.aabb[:3], finer.occupied.shape, finer.cell, strict=True)
+        )
+        for axis, row in enumerate(to_local):
+            at = row[0] * x[:, None, None] + row[1] * y[:, None] + row[2] * z
+            finer.occupied[(at < box[axis]) | (at >= box[axis + 3])] = False
+        made.append(finer.within(finer.tight_aabb(0)) if finer.occupied.any() else finer)
+    return made
+
+
+def framed(linear: np.ndarray) -> np.ndarray:
+    """(4, 4) of a matrix (3, 3)."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = linear
+    return matrix
+
+
 def nodes_of(
-    field: PartsField, grids: Sequence[OccupancyGrid], placement: np.ndarray, cube: float | None = None
+    field: PartsField, grids: Sequence[OccupancyGrid], placement: np.ndarray, of_texels: bool = False
 ) -> list[ImportedNode]:
     """A field in the cells of grids, once for each that has any; all have the same numbers. Unless these lie
-    on texels, the first cascade's side `cube` says how rays are sampled in the first grid; in others samples
-    lie as much farther apart as cells are larger."""
-    held, nodes = [grid for grid in grids if grid.occupied.any()] or grids[:1], []
+    on texels, a grid that says how far apart rays are sampled in it is sampled so."""
+    held, nodes = [grid for grid in grids if grid.occupied.any()], []
+    if not held:
+        raise FormatError("none of the cells that it shows is occupied, so that there is nothing to see")
     for n, grid in enumerate(held):
         resolution = field.resolution
-        if cube is not None:
-            cubes = (field.box[3] - field.box[0]) / cube * grids[0].cell[0] / grid.cell[0]
-            resolution = (min(max(int(np.ceil((SAMPLES - 1) * cubes)) + 1, 2), MAX_TEXELS),) * 3
+        if grid.unit and not of_texels:
+            texels = np.ceil(STEP_PER_VOXEL * (field.box[3:] - field.box[:3]) / grid.unit - 1e-6) + 1
+            resolution = tuple(int(count) for count in texels.clip(2, MAX_TEXELS))
         shown = PartsField(
-            field.shape, field.box, resolution, field.scale, field.shift, field.params, occupancy=grid
-        )
+            field.shape, field.box, resolution, field.scale, field.shift, field.params,
+            occupancy=grid.marked(grid.occupied),
+        )  # fmt: skip
         nodes.append(ImportedNode(shown, placement, "" if len(held) == 1 else f"-{n + 1}"))
     return nodes

@@ -1,12 +1,14 @@
 """Snapshots of Instant-NGP (Müller et al. 2022; github.com/NVlabs/instant-ngp)."""
 
 import itertools
+import operator
+from dataclasses import replace
 
 import numpy as np
 
 from formats.errors import FormatError
 from fusedrf_cli.bridge.importing import tcnn
-from fusedrf_cli.bridge.importing.cells import cascades_of, grids_of, nodes_of, unmortoned
+from fusedrf_cli.bridge.importing.cells import SAMPLED, cascades_of, cropped, grids_of, nodes_of, unmortoned
 from fusedrf_cli.bridge.importing.parts import (
     ColourInput,
     Entries,
@@ -23,7 +25,7 @@ from fusedrf_cli.engine.kinds.assembled.field import PartsShape
 HARMONICS = 16
 FINEST = 2048  # vertices along an axis, for each unit of the scene's scale
 LEAST = 0.01  # optical depth of a step through a cell that is occupied, at most
-CUBE = 1.0  # side of the first cascade
+CROPPED = "it is cut to its crop box, as the program shows it"
 MOST_SCALE = 128
 CYCLED = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
 """From its axes to those of the cameras that it reads."""
@@ -34,9 +36,9 @@ def read(checkpoint) -> Imported:
     root = Entries(checkpoint.entries)
     snapshot = root.inside("snapshot")
     data = dataset_of(snapshot.inside("nerf"))
-    scale, box = scale_of(data), np.zeros(6)
-    box[:3], box[3:] = 0.5 - scale / 2, 0.5 + scale / 2
-    box = box_of(snapshot, "aabb", box)
+    scale = scale_of(data)
+    cube = np.array([0.5 - scale / 2] * 3 + [0.5 + scale / 2] * 3)
+    box = box_of(snapshot, "aabb", cube)
     levels, features = levels_of(root.inside("encoding"), scale)
     layers, colours, rows = networks(root, snapshot, levels, features, data)
     sigma, sections = trunk_layers(layers, eight(len(levels) * features))
@@ -47,10 +49,10 @@ def read(checkpoint) -> Imported:
     shown = "exp" if data.values.get("is_hdr") else "sigmoid"
     shape = PartsShape(encoding, {"part": "trunk_features"}, sigma, rgb, shown)
     field = parts_field(shape, box, (2, 2, 2), {"density_rows": rows} | sections | more)
-    placement = placement_of(data)
-    crop, notes = crop_of(snapshot, box, placement)
-    nodes = nodes_of(field, cells_of(snapshot, box, scale), placement, CUBE)
-    return Imported(nodes, notes_of(snapshot, data) + notes, crop=crop)
+    grids = cells_of(snapshot, cube, scale)
+    shown = cropped_to(snapshot, grids, box)
+    notes = [] if all(map(operator.is_, shown, grids)) else [CROPPED]
+    return Imported(nodes_of(field, shown, placement_of(data)), notes_of(snapshot, data) + notes)
 
 
 def dataset_of(nerf: Entries) -> Entries:
@@ -195,12 +197,12 @@ def numbers(entries: Entries, name: str, dtype: type) -> np.ndarray:
 # -- where there is something --------------------------------------------------------------------------------
 
 
-def cells_of(snapshot: Entries, box: np.ndarray, scale: int) -> list[OccupancyGrid]:
+def cells_of(snapshot: Entries, cube: np.ndarray, scale: int) -> list[OccupancyGrid]:
     """The cells that rays are sampled in."""
     side = snapshot.whole("density_grid_size", 0, 512, 0)
     values = numbers(snapshot, "density_grid_binary", np.float16) if side else np.zeros(0)
     if not len(values):  # never filled
-        return [OccupancyGrid.full(box)]
+        return [replace(OccupancyGrid.full(cube), unit=SAMPLED)]
     cascades = cascades_of(scale)
     if side < 4 or side & (side - 1) or len(values) != cascades * side**3:
         raise FormatError(
@@ -212,26 +214,17 @@ def cells_of(snapshot: Entries, box: np.ndarray, scale: int) -> list[OccupancyGr
     for finer, level in itertools.pairwise(levels):
         half = slice(side // 4, side // 4 + side // 2)
         level[half, half, half] |= finer.reshape(side // 2, 2, side // 2, 2, side // 2, 2).any((1, 3, 5))
-    return grids_of(levels, np.full(3, 0.5), float(scale), CUBE / 2)
+    return grids_of(levels, np.full(3, 0.5), float(scale), 0.5)
 
 
-def crop_of(
-    snapshot: Entries, box: np.ndarray, placement: np.ndarray
-) -> tuple[tuple[np.ndarray, np.ndarray] | None, list[str]]:
-    """The box that rays are cut to, with where its frame lies; none where it cuts nothing off. And notes."""
-    shown, turned = box_of(snapshot, "render_aabb", box), np.eye(4)
+def cropped_to(snapshot: Entries, grids: list[OccupancyGrid], box: np.ndarray) -> list[OccupancyGrid]:
+    """The cells within the box that rays are cut to."""
+    shown, turned = box_of(snapshot, "render_aabb", box), np.eye(3)
     if "render_aabb_to_local" in snapshot.values:
-        matrix = np.asarray(snapshot.get("render_aabb_to_local"), np.float64)
-        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not abs(np.linalg.det(matrix)) > 1e-12:
-            raise FormatError(
-                "snapshot: 'render_aabb_to_local' should be a matrix of 3 × 3 that can be undone"
-            )
-        turned[:3, :3] = matrix
-    corners = np.array(list(itertools.product(*zip(box[:3], box[3:], strict=True)))) @ turned[:3, :3].T
-    if (shown[:3] <= corners.min(0) + 1e-6).all() and (shown[3:] >= corners.max(0) - 1e-6).all():
-        return None, []
-    # what lies beyond the scene anyway needs no face
-    return (shown, placement @ np.linalg.inv(turned)), ["it is cut to its crop box, as the program shows it"]
+        turned = np.asarray(snapshot.get("render_aabb_to_local"), np.float64)
+        if turned.shape != (3, 3) or not abs(np.linalg.det(turned)) > 1e-12:
+            raise FormatError("snapshot: 'render_aabb_to_local' should be a 3 × 3 matrix that can be undone")
+    return cropped(cropped(grids, box), shown, turned)
 
 
 def placement_of(data: Entries) -> np.ndarray:

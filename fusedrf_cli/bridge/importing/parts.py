@@ -40,8 +40,6 @@ class Imported:
     """Sentences about what was chosen, or could not be taken over."""
     rule: str = "max"
     """By which several nodes are composed."""
-    crop: tuple[np.ndarray, np.ndarray] | None = None
-    """A box (6,) that all is cut to, and (4, 4) from its frame to what the file's system calls world."""
 
 
 class Entries:

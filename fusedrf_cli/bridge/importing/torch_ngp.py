@@ -3,6 +3,7 @@ built on it: hash grids, planes and lines, networks, volumes. Its networks may b
 fused kernels or of tiny-cuda-nn, which are one array each."""
 
 import itertools
+import operator
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from formats.errors import FormatError
 from fusedrf_cli.bridge.importing import tcnn, tensorf
-from fusedrf_cli.bridge.importing.cells import SAMPLES, cells_of_bits, nodes_of
+from fusedrf_cli.bridge.importing.cells import cells_of_bits, cropped, nodes_of
 from fusedrf_cli.bridge.importing.nerf import frequencies_of, joined, skipping
 from fusedrf_cli.bridge.importing.parts import (
     ColourInput,
@@ -31,7 +32,12 @@ BASE, FINEST = 16, 2048  # vertices of the coarsest grid, and of the finest for 
 LEVELS, FEATURES, LOG2_ROWS = 16, 2, 19  # of the grid of its tiny-cuda-nn version
 HARMONICS, OUTPUTS = 16, 16
 EXPONENTS = -80.0, 50.0  # as good as none
+SAMPLES = 297  # vertices along an axis by which rays are sampled where there are no cells
 LIMITS = -2.0, 7.0  # of what PVD exponentiates, by its recipe
+AXES = {f"plane_{i}": pair for i, pair in enumerate(((0, 1), (0, 2), (1, 2)))} | {
+    f"line_{i}": (2 - i,) for i in range(3)
+}
+"""Along which each of TensoRF's planes and lines runs."""
 EMA = "its moving averages (ema) are left out, as the system's own rendering does"
 RECIPE = "its densities are taken to be kept between exp(-2) and exp(7), as PVD's options do by default"
 
@@ -121,6 +127,14 @@ def planes(checkpoint, model: Entries, seen: str, limits: tuple[float, float]) -
     rgb, sections = colour_network(layers, order, np.concatenate(columns), rows=count)
     filled = ranks_filled(ranks)
     basis = beside(np.split(basis, np.cumsum(ranks)[:-1], 1), filled)
+    box = cube_of(bound_of(model))
+    if crossed:
+        box, around = with_zeros(box_of(model, "aabb_train"), resolution, box)
+        resolution = tuple(n + sum(more) for n, more in zip(resolution, around, strict=True))
+        density, colour = (
+            {name: np.pad(made[name], [*(around[axis] for axis in AXES[name]), (0, 0)]) for name in made}
+            for made in (density, colour)
+        )
     values = {f"density_{name}": value for name, value in density.items()} | sections
     values |= {f"colour_{name}": value for name, value in colour.items()} | {"rgb_basis": basis}
     part = "plane_line" if crossed else "line"
@@ -128,7 +142,6 @@ def planes(checkpoint, model: Entries, seen: str, limits: tuple[float, float]) -
     sigma = {"part": "density_sum", "activation": "exp", "limits": list(limits)}
     rgb |= {"limits": list(limits)} if seen == "harmonics" else {}
     shape = PartsShape(*encodings, sigma, rgb)
-    box = box_of(model, "aabb_train") if crossed else cube_of(bound_of(model))
     return finished(checkpoint, model, shape, box, resolution, values)
 
 
@@ -145,8 +158,10 @@ def volume(checkpoint, model: Entries) -> Imported:
         {"part": "density_sum", "activation": "exp", "limits": LIMITS},
         {"part": "sh", "coefficients": coefficients},
     )  # fmt: skip
+    box, around = with_zeros(box_of(model, "aabb_train"), grid.shape[:3], cube_of(bound_of(model)))
+    grid = np.pad(grid, [*around, (0, 0)])
     values = {"density_": grid[..., 0], "colour_": grid[..., 1:]}
-    return finished(checkpoint, model, shape, box_of(model, "aabb_train"), grid.shape[:3], values)
+    return finished(checkpoint, model, shape, box, grid.shape[:3], values)
 
 
 def network(checkpoint, model: Entries) -> Imported:
@@ -169,22 +184,20 @@ def finished(
 ) -> Imported:  # fmt: skip
     """The import of a field over a box, in the cells that the file holds occupied; resolution: of its texels,
     None where it has none."""
-    bound, grids, cube = bound_of(model), [OccupancyGrid.full(box)], None
+    bound, of_texels = bound_of(model), resolution is not None
+    grids = [OccupancyGrid.full(cube_of(bound))]
     if "density_bitfield" in model.values:
         bits = np.unpackbits(model.array("density_bitfield", None).astype(np.uint8), bitorder="little")
         grids = cells_of_bits(bits.astype(bool), bound)
-        cube = 2 * min(1.0, bound) if resolution is None else None
+    shown = cropped(grids, box_of(model, "aabb_infer"))
+    cells = cropped(shown, box)
     field = parts_field(shape, box, resolution or (SAMPLES,) * 3, values)
     notes = [EMA] if "ema" in checkpoint.entries else []
-    if not any(grid.occupied.any() for grid in grids):
-        notes.append("none of its cells is occupied: as in the system's own pictures nothing is to be seen")
     if any(str(name).startswith(("bg_net.", "bg_mat")) for name in model.values):
         notes.append("its network of what lies behind the scene (bg_net) is left out")
-    shown, crop = box_of(model, "aabb_infer"), None
-    if (shown[:3] > -bound).any() or (shown[3:] < bound).any():
-        crop = shown, np.eye(4)
+    if not all(map(operator.is_, shown, grids)):
         notes.append("it is cut to the box that the system's pictures show (aabb_infer)")
-    return Imported(nodes_of(field, grids, np.eye(4), cube), notes, crop=crop)
+    return Imported(nodes_of(field, cells, np.eye(4), of_texels), notes)
 
 
 def bound_of(model: Entries) -> float:
@@ -195,6 +208,18 @@ def bound_of(model: Entries) -> float:
         found = [box.tolist() for box in boxes]
         raise FormatError(f"'aabb_train' or 'aabb_infer' should be a cube around 0, found {found}")
     return max(bounds)
+
+
+def with_zeros(
+    box: np.ndarray, resolution: Sequence[int], cube: np.ndarray
+) -> tuple[np.ndarray, list[tuple[int, int]]]:
+    """The box (6,) with as many texels of 0 around as reach the cube (6,) that cells lie in, on each axis and
+    side: what lies outside counts as 0 there, and is exponentiated. No more than there are texels."""
+    texel = (box[3:] - box[:3]) / (np.array(resolution) - 1)
+    before = np.ceil(np.maximum(box[:3] - cube[:3], 0) / texel).astype(int).clip(max=resolution)
+    after = np.ceil(np.maximum(cube[3:] - box[3:], 0) / texel).astype(int).clip(max=resolution)
+    wider = np.concatenate([box[:3] - before * texel, box[3:] + after * texel])
+    return wider, list(zip(before.tolist(), after.tolist(), strict=True))
 
 
 def cube_of(bound: float) -> np.ndarray:
