@@ -31,6 +31,7 @@ HARMONICS = 16
 USUAL = {"base_res": 16, "features_per_level": 2, "hidden_dim": 64, "hidden_dim_color": 64}
 SIZES = {"max_res": 2048, "num_levels": 16, "log2_hashmap_size": 19}
 """What a model of before these were stored in the file has, unless its settings say so."""
+DEPTHS = 1, 2, 3, 4, 5, 6, 0  # hidden layers that networks may have beside the usual
 MOST_SAMPLES = 512  # vertices along an axis by which rays are sampled
 DENSITY = 0.01  # average_init_density of the recipe
 OWN_ARRAYS = "mlp_base.params", "mlp_base.model.params", "mlp_base_mlp.tcnn_encoding.params"
@@ -204,8 +205,8 @@ def tcnn_base(state: Entries, settings: Entries, finest: int, count: int, log2_r
     apart = name == OWN_ARRAYS[2]
     table = halves(state, "mlp_base_grid.tcnn_encoding.params") if apart else None
     found = settings.whole("features_per_level", 1, 8, USUAL["features_per_level"])
-    for features, neurons, hidden, outputs in product(
-        dict.fromkeys((found, 1, 2, 4, 8)), widths(settings, "hidden_dim"), range(8), (16, 32, 48, 64)
+    for features, outputs, neurons, hidden in product(
+        dict.fromkeys((found, 1, 2, 4, 8)), (16, 32, 48, 64), widths(settings, "hidden_dim"), (1, *DEPTHS)
     ):
         shapes = tcnn.shapes_of(count * features, neurons, hidden, outputs, by_of(neurons))
         if tcnn.size_of(shapes) + (0 if apart else rows * features) == len(params) and (
@@ -221,11 +222,8 @@ def tcnn_head(state: Entries, settings: Entries, most: int, codes: int) -> tuple
     are: as many as it reads, of at most `most`."""
     name = "mlp_head.params" if "mlp_head.params" in state.values else "mlp_head.tcnn_encoding.params"
     params = halves(state, name)
-    wanted = settings.whole("geo_feat_dim", 1, 255, most - 1) + 1
     for outputs, neurons, hidden in product(
-        dict.fromkeys((min(wanted, most), *range(most, 1, -1))),
-        widths(settings, "hidden_dim_color"),
-        range(8),
+        range(most, 1, -1), widths(settings, "hidden_dim_color"), (2, *DEPTHS)
     ):
         read = HARMONICS + outputs - 1 + codes
         shapes = tcnn.shapes_of(read, neurons, hidden, 3, by_of(neurons))

@@ -154,7 +154,8 @@ def root_of(made: Snapshot) -> dict:
         "params_binary": numbers.astype(np.float32 if made.float32 else np.float16).tobytes(),
         "params_type": "float" if made.float32 else "__half",
         "render_aabb": {"min": list(made.crop[:3]), "max": list(made.crop[3:])} if made.crop else cube,
-        "render_aabb_to_local": [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], "training_step": 2000, "version": 1,
+        "render_aabb_to_local": [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]],
+        "training_step": 2000, "version": 1,
     }  # fmt: skip
     directions = [{"n_dims_to_encode": 3, "otype": "SphericalHarmonics", "degree": 4}, {"otype": "Identity"}]
     return {
