@@ -24,7 +24,7 @@ from fusedrf_cli.option_types import BoxType, InputType, PositiveType, VectorTyp
 @options.memory
 @options.reporting
 def command(**words):
-    """Turn another system's file into a bundle that answers exactly as it does.
+    """Turn another system's file into a bundle of its numbers.
 
     FILE is a checkpoint of TensoRF, Plenoxels (svox2), DVGO, Instant-NGP, NeRF (nerf-pytorch),
     torch-ngp, PVD or nerfacto, or the folder of a run, whose newest checkpoint is taken; or Gaussian
@@ -33,6 +33,6 @@ def command(**words):
 
     \b
     Example:
-      fusedrf import logs/lego/lego.th -o lego.rfpack
+      fusedrf import lego.th -o lego.rfpack
     """
     return verbs.import_field(**words)

@@ -23,8 +23,8 @@ def reaches(axes, extent, offset, half, along):
 @serial
 def fill_cells(centres, axes, extents, lo, cell, counts, along, room, position, members):
     """Count, or where `members` (M,) has room write, the splats of each cell: position (cells,) gains how
-    many there are, or says where the next one goes. centres (N, 3), axes (N, 3, 3) and extents (N, 3) of splats;
-    room (4, 3) to compute in."""
+    many there are, or says where the next one goes. centres (N, 3), axes (N, 3, 3) and extents
+    (N, 3) of splats; room (4, 3) to compute in."""
     first, last, offset, half = room[0], room[1], room[2], room[3]
     for a in range(3):
         half[a] = 0.5 * cell[a]
