@@ -241,7 +241,9 @@ SYSTEMS = {  # the first whose rule fits counts
     "nerfacto": System(
         "nerfstudio's nerfacto",
         "pipeline/*_model.*field.mlp_base* pipeline/*_model.*field.mlp_head* "
-        "pipeline/*_model.*proposal_networks.*",
+        "pipeline/*_model.*proposal_networks.*"
+        "| pipeline/*_model.*field.mlp_base* pipeline/*_model.*field.mlp_head* "
+        "pipeline/*_model.*occupancy_grid.*",
         ("config.yml", "dataparser_transforms.json"),
     ),
     "k-planes": System("K-Planes", "model/field.grids.0.0:* model/field.sigma_net.params:*", ("config.py",)),

@@ -131,16 +131,16 @@ def networks(
         raise FormatError(
             f"snapshot: 'params_binary' has {len(params):,} numbers, which its configuration does not"
         )
-    layers, params = tcnn.network_of(params, own, inputs, outputs, 0.0)
+    # the colour's reads what the density's is filled up to as well
+    layers, params = tcnn.network_of(params, own, inputs, made, 0.0)
     shading_size = tcnn.size_of(shading)
     colours, _ = tcnn.network_of(params[:shading_size], shading, tcnn.padded(made + seen, by), 3, 0.0)
     (first, _), *others = colours
     # Codes of pictures are 0, as where no picture is asked for; what they are filled up with is 1.
     filled = first[:, made + HARMONICS + extra : made + seen] if extra else first[:, :0]
     bias = filled.astype(np.float64).sum(1)
-    first = first[:, [*range(outputs), *range(made, made + HARMONICS)]]
-    rows_at = tcnn.rows_of(params[shading_size:], levels, features)
-    return layers, [(first, bias), *others], rows_at
+    first = first[:, : made + HARMONICS]
+    return layers, [(first, bias), *others], tcnn.rows_of(params[shading_size:], levels, features)
 
 
 def network(root: Entries, name: str) -> Entries:

@@ -35,12 +35,16 @@ DEPTHS = 1, 2, 3, 4, 5, 6, 0  # hidden layers that networks may have beside the 
 MOST_SAMPLES = 512  # vertices along an axis by which rays are sampled
 DENSITY = 0.01  # average_init_density of the recipe
 OWN_ARRAYS = "mlp_base.params", "mlp_base.model.params", "mlp_base_mlp.tcnn_encoding.params"
-"""Names of the network of density where tiny-cuda-nn computes it: of before 2023, now, and between."""
+"""Names of the network of density where tiny-cuda-nn computes it: of 2022, now, and of 2023."""
 
 
 def read(checkpoint) -> Imported:
     """The field of a checkpoint. Raises FormatError."""
-    state = state_of(Entries(checkpoint.entries).inside("pipeline"))
+    pipeline = Entries(checkpoint.entries).inside("pipeline")
+    state, marched = (
+        state_of(pipeline),
+        any("_model.occupancy_grid." in str(name) for name in pipeline.values),
+    )
     settings = Entries(model_settings(checkpoint.beside.get("config.yml")), "config.yml: ")
     finest, count, log2_rows = (
         int((state if name in state.values else settings).number(name, default))
@@ -71,7 +75,11 @@ def read(checkpoint) -> Imported:
     box = np.array([-2.0] * 3 + [2.0] * 3) if contracted else own_box(state)
     cells = OccupancyGrid.full(box, space=contracted_linf if contracted else bounded)
     resolution = (min(finest, MOST_SAMPLES) + 1,) * 3
-    scale, notes = density_of(state, settings)
+    scale, notes = density_of(state, settings, marched)
+    if marched:  # nerfstudio's instant-ngp, whose field this is as well
+        notes.append(
+            "the grid of cells that its pictures are sampled in is left out: it is sampled everywhere"
+        )
     field = parts_field(
         shape, box, resolution, {"density_rows": rows} | sections | more, scale, occupancy=cells
     )
@@ -98,15 +106,15 @@ def model_settings(config: Any) -> Mapping[str, Any]:
     return config if isinstance(config, Mapping) else {}
 
 
-def density_of(state: Entries, settings: Entries) -> tuple[float, list[str]]:
-    """What densities are multiplied by, and notes. It is 1 where settings do not know it, as versions of
-    before that setting do."""
+def density_of(state: Entries, settings: Entries, marched: bool) -> tuple[float, list[str]]:
+    """What densities are multiplied by, and notes. It is 1 where settings do not know it, as of versions
+    before that setting, and of models that have none."""
     if settings.values:
         scale = settings.number("average_init_density", 1.0)
         if not scale > 0:
             raise FormatError(f"config.yml: 'average_init_density' should be above 0, found {scale:g}")
         return scale, []
-    before = not {"mlp_base.model.params", "mlp_base.model.0.hash_table"} & set(state.values)
+    before = marched or not {"mlp_base.model.params", "mlp_base.model.0.hash_table"} & set(state.values)
     scale = 1.0 if before else DENSITY
     return scale, [
         "no config.yml lies beside it: its recipe's settings are assumed, densities that begin at "

@@ -38,6 +38,10 @@ AXES = {f"plane_{i}": pair for i, pair in enumerate(((0, 1), (0, 2), (1, 2)))} |
     f"line_{i}": (2 - i,) for i in range(3)
 }
 """Along which each of TensoRF's planes and lines runs."""
+FRAME = (
+    "it lies in the system's own coordinates, which are the capture's y, z, x, scaled and moved by options "
+    "that it does not hold"
+)
 EMA = "its moving averages (ema) are left out, as the system's own rendering does"
 RECIPE = "its densities are taken to be kept between exp(-2) and exp(7), as PVD's options do by default"
 
@@ -192,7 +196,7 @@ def finished(
     shown = cropped(grids, box_of(model, "aabb_infer"))
     cells = cropped(shown, box)
     field = parts_field(shape, box, resolution or (SAMPLES,) * 3, values)
-    notes = [EMA] if "ema" in checkpoint.entries else []
+    notes = [FRAME, *([EMA] if "ema" in checkpoint.entries else [])]
     if any(str(name).startswith(("bg_net.", "bg_mat")) for name in model.values):
         notes.append("its network of what lies behind the scene (bg_net) is left out")
     if not all(map(operator.is_, shown, grids)):

@@ -32,6 +32,7 @@ class Snapshot:
     growth: float | None = None
     grid: str = "HashGrid"
     neurons: int = 16
+    outputs: int | None = None
     hidden: tuple[int, int] = (1, 2)
     cutlass: bool = False
     float32: bool = False
@@ -60,6 +61,7 @@ SNAPSHOTS = {
     "every vertex": Snapshot(grid="DenseGrid", growth=1.5, base=4),
     "a base that follows": Snapshot(base=None, log2_rows=10),
     "Cutlass": Snapshot(cutlass=True, neurons=24),
+    "outputs that are filled up": Snapshot(outputs=5),
     "no hidden layer": Snapshot(cutlass=True, hidden=(0, 0)),
     "without halves": Snapshot(float32=True, cutlass=True, neurons=32),
     "mitsuba": Snapshot(mitsuba=True, scale=0.66, offset=(0.165, 0.2, 0.165), aabb_scale=2),
@@ -157,10 +159,11 @@ def root_of(made: Snapshot) -> dict:
         "render_aabb_to_local": [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]],
         "training_step": 2000, "version": 1,
     }  # fmt: skip
+    outputs = {"n_output_dims": made.outputs} if made.outputs else {}
     directions = [{"n_dims_to_encode": 3, "otype": "SphericalHarmonics", "degree": 4}, {"otype": "Identity"}]
     return {
         "dir_encoding": {"nested": directions, "otype": "Composite"}, "encoding": encoding,
-        "loss": {"otype": "Huber"}, "network": mlp | {"n_hidden_layers": made.hidden[0]},
+        "loss": {"otype": "Huber"}, "network": mlp | {"n_hidden_layers": made.hidden[0]} | outputs,
         "rgb_network": mlp | {"n_hidden_layers": made.hidden[1]}, "snapshot": snapshot,
     }  # fmt: skip
 

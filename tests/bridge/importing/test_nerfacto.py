@@ -39,6 +39,8 @@ class Run:
     config: bool = True
     prefix: str = "_model."
     transforms: bool = True
+    marched: bool = False
+    """Whether it is nerfstudio's instant-ngp."""
 
 
 RUNS = {
@@ -63,6 +65,7 @@ RUNS = {
     "of 2023, tiny-cuda-nn": Run(tcnn=True, layout="between", density=None),
     "of 2022": Run(tcnn=True, layout="before", density=None, config=False, wide=(64, 64)),
     "without transforms": Run(transforms=False),
+    "nerfstudio's instant-ngp": Run(tcnn=True, codes=0, density=None, marched=True),
 }
 BOX = np.array([[-1.0, -1.5, -0.5], [1.5, 1.0, 1.0]], np.float32)
 SCALE, TURN = 0.4, 0.7
@@ -151,7 +154,8 @@ def state_of(run: Run) -> dict[str, np.ndarray]:
         field |= {f"mlp_head.layers.{i}.weight": weight for i, (weight, _) in enumerate(head)}
         field |= {f"mlp_head.layers.{i}.bias": bias for i, (_, bias) in enumerate(head)}
     state = {f"field.{name}": value for name, value in field.items()}
-    state["proposal_networks.0.aabb"] = state["field.mlp_pred_normals.layers.0.weight"] = BOX
+    state["occupancy_grid.aabbs" if run.marched else "proposal_networks.0.aabb"] = BOX
+    state["field.mlp_pred_normals.layers.0.weight"] = BOX
     state["camera_optimizer.pose_adjustment"] = np.zeros((9, 6), np.float32)
     return {run.prefix + name: value for name, value in state.items()}
 
@@ -254,6 +258,7 @@ def test_nerfacto(name, tmp_path):
     oracle.assert_alike(oracle.answers(imported, points, d), expected(run, points, d))
     said = " ".join(imported.notes)
     assert ("no config.yml" in said) == (not run.config)
+    assert ("sampled everywhere" in said) == run.marched
     assert ("no dataparser_transforms.json" in said) == (not run.transforms)
     assert ("their mean" in said) == bool(run.codes and run.average)
     assert ("fixed to 0" in said) == bool(run.codes and not run.average)
