@@ -77,10 +77,19 @@ def box_of(entries: Entries, name: str, otherwise: np.ndarray) -> np.ndarray:
     if name not in entries.values:
         return otherwise
     found = entries.inside(name)
-    low, high = (np.asarray(found.get(end), np.float64).reshape(-1) for end in ("min", "max"))
-    if low.shape != (3,) or high.shape != (3,) or np.isnan(low).any() or np.isnan(high).any():
-        raise FormatError(f"{entries.where}'{name}' should be three minima and three maxima")
+    low, high = listed(found, "min", 3), listed(found, "max", 3)
     return np.concatenate([low, high]) if (low < high).all() and np.isfinite([low, high]).all() else otherwise
+
+
+def listed(entries: Entries, name: str, *shape: int) -> np.ndarray:
+    """Numbers in lists, as float64; they may be infinite."""
+    try:
+        values = np.asarray(entries.get(name), np.float64)
+    except (TypeError, ValueError):
+        values = np.full(shape, np.nan)
+    if values.shape != shape or np.isnan(values).any():
+        raise FormatError(f"{entries.where}'{name}' should be {' × '.join(map(str, shape))} numbers")
+    return values
 
 
 # -- numbers -------------------------------------------------------------------------------------------------
@@ -221,9 +230,9 @@ def cropped_to(snapshot: Entries, grids: list[OccupancyGrid], box: np.ndarray) -
     """The cells within the box that rays are cut to."""
     shown, turned = box_of(snapshot, "render_aabb", box), np.eye(3)
     if "render_aabb_to_local" in snapshot.values:
-        turned = np.asarray(snapshot.get("render_aabb_to_local"), np.float64)
-        if turned.shape != (3, 3) or not abs(np.linalg.det(turned)) > 1e-12:
-            raise FormatError("snapshot: 'render_aabb_to_local' should be a 3 × 3 matrix that can be undone")
+        turned = listed(snapshot, "render_aabb_to_local", 3, 3)
+        if not 1e-12 < abs(np.linalg.det(turned)) < np.inf:
+            raise FormatError("snapshot: 'render_aabb_to_local' should be a matrix that can be undone")
     return cropped(cropped(grids, box), shown, turned)
 
 
@@ -247,7 +256,7 @@ def notes_of(snapshot: Entries, data: Entries) -> list[str]:
         notes.append(
             "it does not say where its capture lies: the program's usual scale 0.33 and offset 0.5 are undone"
         )
-    if np.any(np.asarray(data.values.get("envmap_resolution", [0, 0])) > 0):
+    if "envmap_resolution" in data.values and listed(data, "envmap_resolution", 2).any():
         notes.append("its environment map is left out")
     if data.whole("n_extra_learnable_dims", 0, 256, 0):
         notes.append("its codes of pictures are taken to be 0")

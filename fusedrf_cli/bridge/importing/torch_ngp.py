@@ -219,9 +219,13 @@ def with_zeros(
 ) -> tuple[np.ndarray, list[tuple[int, int]]]:
     """The box (6,) with as many texels of 0 around as reach the cube (6,) that cells lie in, on each axis and
     side: what lies outside counts as 0 there, and is exponentiated. No more than there are texels."""
+    if min(resolution) < 2:
+        raise FormatError(f"grids should have 2 texels along an axis at least, found {list(resolution)}")
     texel = (box[3:] - box[:3]) / (np.array(resolution) - 1)
-    before = np.ceil(np.maximum(box[:3] - cube[:3], 0) / texel).astype(int).clip(max=resolution)
-    after = np.ceil(np.maximum(cube[3:] - box[3:], 0) / texel).astype(int).clip(max=resolution)
+    before, after = (
+        np.minimum(np.ceil(np.maximum(more, 0) / texel), resolution).astype(int)
+        for more in (box[:3] - cube[:3], cube[3:] - box[3:])
+    )
     wider = np.concatenate([box[:3] - before * texel, box[3:] + after * texel])
     return wider, list(zip(before.tolist(), after.tolist(), strict=True))
 

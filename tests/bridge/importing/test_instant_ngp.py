@@ -267,8 +267,9 @@ def test_the_command_writes_what_it_shows(tmp_path):
         ("snapshot.density_grid_binary", bytes(2 * SIDE**3), "there is nothing to see"),
         ("snapshot.nerf.dataset.scale", 0.0, "'scale' should be above 0, found 0"),
         ("snapshot.nerf.aabb_scale", 3, "'aabb_scale' should be a power of two, found 3"),
-        ("snapshot.render_aabb", {"min": [0, 0], "max": [1]}, "three minima and three maxima"),
-        ("snapshot.render_aabb_to_local", [[0] * 3] * 3, "3 × 3 matrix that can be undone"),
+        ("snapshot.render_aabb", {"min": [0, 0], "max": [1]}, "'min' should be 3 numbers"),
+        ("snapshot.render_aabb_to_local", [["x"]], "should be 3 × 3 numbers"),
+        ("snapshot.render_aabb_to_local", [[0] * 3] * 3, "should be a matrix that can be undone"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_a_sentence(place, value, said, tmp_path):
