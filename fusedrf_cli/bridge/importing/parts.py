@@ -64,8 +64,10 @@ class Entries:
     def values_of(self, name: str) -> np.ndarray:
         """An entry as an array of any type; of lists that differ in length it is no numbers."""
         value = self.get(name)
+        if hasattr(value, "array"):
+            return value.array()
         try:
-            return value.array() if hasattr(value, "array") else np.asarray(value)
+            return np.asarray(value)
         except ValueError:
             return np.asarray(None)
 
