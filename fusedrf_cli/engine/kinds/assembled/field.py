@@ -24,7 +24,6 @@ PARTS: dict[str, tuple[ModuleType, ...]] = {
     "rgb": (rgb, sh, sh_basis, mlp),
 }
 """What may fill each slot, by the names of their modules."""
-HASH_ROWS = "hash.rows"  # the array of the rows of a hash grid, in files
 FARTHEST = 1e4
 """From 0, of a box whose points are encoded as they are: `frequencies.bound` counts on it."""
 
@@ -99,11 +98,24 @@ class PartsField(AssembledField):
 
     kind = "assembled"
     shape_type = PartsShape
+    hash_rows = "hash.rows"
+    """What files call the rows of a hash grid: a part of its own."""
 
     @classmethod
     def slots_of(cls, shape: PartsShape) -> dict[str, Slot]:
         """See AssembledField."""
         return shape.slots()
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict]:
+        """See BoxField; rows of a hash grid are a part that fields may have in common, as those do that are
+        one field in several grids of cells."""
+        arrays, metadata = super().state()
+        return arrays, metadata | ({"shared": ["hash"]} if self.hash_rows in arrays else {})
+
+    @classmethod
+    def stored_name(cls, name: str) -> str:
+        """See BoxField."""
+        return cls.hash_rows if name == "density_rows" else name
 
     @cached_property
     def colour_activation(self) -> str:
@@ -114,17 +126,6 @@ class PartsField(AssembledField):
     def over_texels(self) -> bool:
         """See ComputedField: rows of a hash grid and networks are of the whole cube."""
         return all(slot.module in (plane_line, line, grid) for slot in list(self.slots.values())[:2])
-
-    def state(self) -> tuple[dict[str, np.ndarray], dict]:
-        """See BoxField; rows of a hash grid are a part that fields may have in common, as those do that are
-        one field in several grids of cells."""
-        arrays, metadata = super().state()
-        return arrays, metadata | ({"shared": ["hash"]} if HASH_ROWS in arrays else {})
-
-    @classmethod
-    def stored_name(cls, name: str) -> str:
-        """See BoxField."""
-        return HASH_ROWS if name == "density_rows" else name
 
     def check_answers(self) -> None:
         """See BoxField."""
