@@ -50,7 +50,8 @@ def read(checkpoint) -> Imported:
     shape = PartsShape(encoding, {"part": "trunk_features"}, sigma, rgb, shown)
     field = parts_field(shape, box, (2, 2, 2), {"density_rows": rows} | sections | more)
     grids = cells_of(snapshot, cube, scale)
-    shown = cropped_to(snapshot, grids, box)
+    # that of the capture's transforms.json, until a user changes it
+    shown = cropped_to(snapshot if "render_aabb" in snapshot.values else data, grids, box)
     notes = [] if all(map(operator.is_, shown, grids)) else [CROPPED]
     return Imported(nodes_of(field, shown, placement_of(data)), notes_of(snapshot, data) + notes)
 
@@ -226,13 +227,13 @@ def cells_of(snapshot: Entries, cube: np.ndarray, scale: int) -> list[OccupancyG
     return grids_of(levels, np.full(3, 0.5), float(scale), 0.5)
 
 
-def cropped_to(snapshot: Entries, grids: list[OccupancyGrid], box: np.ndarray) -> list[OccupancyGrid]:
+def cropped_to(said: Entries, grids: list[OccupancyGrid], box: np.ndarray) -> list[OccupancyGrid]:
     """The cells within the box that rays are cut to."""
-    shown, turned = box_of(snapshot, "render_aabb", box), np.eye(3)
-    if "render_aabb_to_local" in snapshot.values:
-        turned = listed(snapshot, "render_aabb_to_local", 3, 3)
+    shown, turned = box_of(said, "render_aabb", box), np.eye(3)
+    if "render_aabb_to_local" in said.values:
+        turned = listed(said, "render_aabb_to_local", 3, 3)
         if not 1e-12 < abs(np.linalg.det(turned)) < np.inf:
-            raise FormatError("snapshot: 'render_aabb_to_local' should be a matrix that can be undone")
+            raise FormatError(f"{said.where}'render_aabb_to_local' should be a matrix that can be undone")
     return cropped(cropped(grids, box), shown, turned)
 
 

@@ -43,7 +43,10 @@ FRAME = (
     "that it does not hold"
 )
 EMA = "its moving averages (ema) are left out, as the system's own rendering does"
-RECIPE = "its densities are taken to be kept between exp(-2) and exp(7), as PVD's options do by default"
+RECIPE = (
+    "what it exponentiates, and colour features of planes, are taken to be kept between -2 and 7, as PVD's "
+    "options do by default"
+)
 
 
 def read(checkpoint) -> Imported:

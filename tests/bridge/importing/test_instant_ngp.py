@@ -9,6 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 
+from formats.bundle import OpenBundle
 from formats.foreign.systems import open_checkpoint
 from fusedrf_cli import verbs
 from fusedrf_cli.bridge.importing import instant_ngp
@@ -46,6 +47,8 @@ class Snapshot:
     crop: tuple[float, ...] = ()
     turned: float = 0.0
     """Radians that the crop box is turned by."""
+    by_capture: bool = False
+    """Whether the capture's transforms.json said so."""
     zipped: bool = True
 
 
@@ -72,6 +75,7 @@ SNAPSHOTS = {
     "cut": Snapshot(crop=(0.1, 0.0, 0.3, 0.9, 0.7, 1.0)),
     "cut, never filled": Snapshot(crop=(0.1, -0.5, 0.3, 0.9, 0.7, 2.0), cells="unfilled", aabb_scale=2),
     "cut to a turned box": Snapshot(crop=(-0.2, 0.1, 0.05, 0.7, 1.2, 0.9), turned=0.5),
+    "cut by its capture": Snapshot(crop=(0.1, 0.0, 0.3, 0.9, 0.7, 1.0), by_capture=True),
     "without a capture": Snapshot(scale=None),
 }
 """By what is peculiar."""
@@ -160,6 +164,8 @@ def root_of(made: Snapshot) -> dict:
         "training_step": 2000, "version": 1,
     }  # fmt: skip
     outputs = {"n_output_dims": made.outputs} if made.outputs else {}
+    if made.by_capture:
+        nerf["dataset"]["render_aabb"] = snapshot.pop("render_aabb")
     directions = [{"n_dims_to_encode": 3, "otype": "SphericalHarmonics", "degree": 4}, {"otype": "Identity"}]
     return {
         "dir_encoding": {"nested": directions, "otype": "Composite"}, "encoding": encoding,
@@ -248,6 +254,8 @@ def test_the_command_writes_what_it_shows(tmp_path):
     report = verbs.import_field(checkpoint.path, output=tmp_path / "f.rfpack")
     assert [entry["name"] for entry in report["fields"]] == ["base-1", "base-2"]
     assert report["notes"] == [instant_ngp.CROPPED]
+    kinds = sorted(header.kind for header in OpenBundle(tmp_path / "f.rfpack").headers.values())
+    assert kinds == ["assembled", "assembled", "part"]  # the grid's rows, once
     oracle.assert_alike(oracle.asked(tmp_path / "f.rfpack", points, d), expected(made, points, d), 5e-3)
 
 
