@@ -146,11 +146,20 @@ def networks(
     shading_size = tcnn.size_of(shading)
     colours, _ = tcnn.network_of(params[:shading_size], shading, tcnn.padded(made + seen, by), 3, 0.0)
     (first, _), *others = colours
-    # Codes of pictures are 0, as where no picture is asked for; what they are filled up with is 1.
-    filled = first[:, made + HARMONICS + extra : made + seen] if extra else first[:, :0]
-    bias = filled.astype(np.float64).sum(1)
+    # what is the same everywhere: the code of a picture, filled up with 1
+    same = np.ones(seen - HARMONICS)
+    same[:extra] = code_of(snapshot, extra)
+    bias = first[:, made + HARMONICS : made + seen].astype(np.float64) @ same
     first = first[:, : made + HARMONICS]
     return layers, [(first, bias), *others], tcnn.rows_of(params[shading_size:], levels, features)
+
+
+def code_of(snapshot: Entries, count: int) -> np.ndarray:
+    """The code (count,) by which pictures are shown: the first photo's, or 0 where the file has none."""
+    codes = snapshot.inside("nerf").values.get("extra_dims_opt")
+    if not count or not isinstance(codes, list) or not codes or not isinstance(codes[0], dict):
+        return np.zeros(count)
+    return Entries(codes[0], "snapshot: nerf: extra_dims_opt: ").array("variable", count).astype(np.float64)
 
 
 def network(root: Entries, name: str) -> Entries:
@@ -259,6 +268,7 @@ def notes_of(snapshot: Entries, data: Entries) -> list[str]:
         )
     if "envmap_resolution" in data.values and listed(data, "envmap_resolution", 2).any():
         notes.append("its environment map is left out")
-    if data.whole("n_extra_learnable_dims", 0, 256, 0):
-        notes.append("its codes of pictures are taken to be 0")
+    if count := data.whole("n_extra_learnable_dims", 0, 256, 0):
+        shown = "the first photo's, as the program shows it" if code_of(snapshot, count).any() else "0"
+        notes.append(f"its codes of pictures are fixed to {shown}")
     return notes

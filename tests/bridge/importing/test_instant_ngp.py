@@ -38,6 +38,7 @@ class Snapshot:
     cutlass: bool = False
     float32: bool = False
     extra: int = 0
+    codes: bool = True
     mitsuba: bool = False
     hdr: bool = False
     scale: float | None = 0.33
@@ -70,6 +71,7 @@ SNAPSHOTS = {
     "mitsuba": Snapshot(mitsuba=True, scale=0.66, offset=(0.165, 0.2, 0.165), aabb_scale=2),
     "high dynamic range": Snapshot(hdr=True),
     "codes of pictures": Snapshot(extra=5),
+    "codes of pictures, none in the file": Snapshot(extra=16, codes=False),
     "cells that no camera saw": Snapshot(cells="none seen", aabb_scale=2),
     "never filled": Snapshot(cells="unfilled", aabb_scale=4),
     "cut": Snapshot(crop=(0.1, 0.0, 0.3, 0.9, 0.7, 1.0)),
@@ -130,6 +132,11 @@ def numbers_of(made: Snapshot):
     return density, colour, tables, values.astype(np.float16)
 
 
+def codes_of(made: Snapshot) -> list[list[float]]:
+    """Of two photos."""
+    return np.random.default_rng(9).uniform(-1, 1, (2, made.extra)).astype(np.float32).tolist()
+
+
 def root_of(made: Snapshot) -> dict:
     """The map that a snapshot is."""
     density, colour, tables, cells = numbers_of(made)
@@ -146,6 +153,9 @@ def root_of(made: Snapshot) -> dict:
     cube = {"min": [0.5 - half] * 3, "max": [0.5 + half] * 3}
     c, s = math.cos(made.turned), math.sin(made.turned)
     nerf = {"aabb_scale": made.aabb_scale, "cam_pos_offset": [], "cam_rot_offset": [], "extra_dims_opt": []}
+    if made.extra and made.codes:
+        states = [{"iter": 9, "variable": code, "first_moment": code} for code in codes_of(made)]
+        nerf["extra_dims_opt"] = states
     if made.scale is not None:
         nerf["dataset"] = {
             "aabb_scale": made.aabb_scale, "envmap_resolution": [0, 0], "from_mitsuba": made.mitsuba,
@@ -209,9 +219,8 @@ def expected(made: Snapshot, points: np.ndarray, d: np.ndarray) -> tuple[np.ndar
     h = oracle.grid(u, [table.astype(np.float64) for table in tables], scales, sides)
     own, shading = widths_of(made)
     h = oracle.network(np.pad(h, ((0, 0), (0, own[0] - h.shape[1]))), *density)
-    codes = np.concatenate(
-        [np.zeros((len(p), made.extra)), np.ones((len(p), shading[0] - 32 - made.extra))], 1
-    )
+    code = codes_of(made)[0] if made.codes else [0.0] * made.extra
+    codes = np.tile([*code, *[1.0] * (shading[0] - 32 - made.extra)], (len(p), 1))
     raw = oracle.network(np.concatenate([h, oracle.harmonics(d), codes], 1), *colour)[:, :3]
     rgb = np.exp(raw.clip(-10, 10)) if made.hdr else oracle.sigmoid(raw)
     inside = (np.abs(p - 0.5) <= made.aabb_scale / 2).all(1)
@@ -244,7 +253,8 @@ def test_instant_ngp(name, tmp_path):
     oracle.assert_alike(oracle.answers(imported, points, d), expected(made, points, d))
     said = " ".join(imported.notes)
     assert ("crop box" in said) == bool(made.crop)
-    assert ("codes of pictures" in said) == bool(made.extra)
+    assert ("first photo's" in said) == bool(made.extra and made.codes)
+    assert ("fixed to 0" in said) == bool(made.extra and not made.codes)
     assert ("scale 0.33 and offset 0.5" in said) == (made.scale is None)
 
 
