@@ -2,9 +2,9 @@
 
 DATA is a folder with a folder for each checkpoint, in which answers.npz has points, directions, σ and colours
 by the system's own code, and view.npz and view.json a picture by its own renderer. Each file is imported as
-`fusedrf import` does it. Prints a Markdown table: the relative error of σ where it is above 0, and the largest
-of a colour's, as median and 99 %; the share of the points without density where ours is 0 as well; the PSNR of
-the picture, at half a voxel's step and at a quarter of that.
+`fusedrf import` does it. Prints a Markdown table: the relative error of σ where it is above 0, and the
+largest of a colour's, as median and 99 %; the share of the points without density where ours is 0 as well;
+the PSNR of the picture, at half a voxel's step and at a quarter of that.
 """
 
 import argparse
