@@ -33,6 +33,9 @@ NEAR_ALL = 0.995
 """Share of the splats that the cells are made for: a capture has a few far away, some as large as all."""
 
 
+ARRAYS = "centres", "scales", "rotations", "opacities", "harmonics"
+
+
 class SplatsField(ComputedField):
     """N Gaussians: centres (N, 3), standard deviations `scales` (N, 3) along their own axes, which
     `rotations` (N, 4), unit quaternions w x y z, turn to the frame's; opacities (N,) in [0, 1]; harmonics
@@ -120,6 +123,25 @@ class SplatsField(ComputedField):
         """(6,) that of its cells."""
         return self.cells.aabb
 
+    over_texels = False
+
+    @property
+    def resolution(self) -> tuple[int, ...]:
+        """Corners of its cells per axis, on which parts of it are cut."""
+        return tuple(n + 1 for n in self.cells.occupied.shape)
+
+    @property
+    def held(self) -> np.ndarray:
+        """(N,) bool: the splats that reach into an occupied cell."""
+        at = ((self.occupancy.centres() - self.box[:3]) / self.cells.cell).astype(np.int64)
+        last = np.array(self.cells.occupied.shape) - 1
+        numbers = np.ravel_multi_index(tuple(np.clip(at, 0, last).T), self.cells.occupied.shape)
+        cells = np.zeros(len(self.first) - 1, bool)
+        cells[numbers] = True
+        held = np.zeros(len(self.centres), bool)
+        held[self.members[np.repeat(cells, np.diff(self.first))]] = True
+        return held
+
     def reference(
         self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -157,7 +179,8 @@ class SplatsField(ComputedField):
         }  # fmt: skip
         cells = {"aabb": self.cells.aabb.tolist(), "counts": list(self.cells.occupied.shape)}
         metadata = {"splats": len(self.centres), "cells": cells}
-        if not np.array_equal(self.occupancy.occupied.ravel(), np.diff(self.first) > 0):
+        as_held = np.array_equal(self.occupancy.occupied.ravel(), np.diff(self.first) > 0)
+        if not (as_held and np.array_equal(self.occupancy.aabb, self.box)):
             arrays |= packed_bits("occupancy", self.occupancy.occupied)
             metadata["occupancy"] = {
                 "aabb": self.occupancy.aabb.tolist(), "counts": list(self.occupancy.occupied.shape)
