@@ -238,9 +238,8 @@ def with_point(layers: Sequence[Layer], inputs: int) -> list[Layer]:
 
 def stacked(*layers: Layer) -> Layer:
     """Layers that read the same, as one."""
-    if len({weight.shape[1] for weight, _ in layers}) > 1:
-        found = " and ".join(str(weight.shape[1]) for weight, _ in layers)
-        raise FormatError(f"layers behind the same one should read as many numbers, found {found}")
+    if len(reads := {weight.shape[1] for weight, _ in layers}) > 1:
+        raise FormatError(f"layers side by side should read as many numbers, found {sorted(reads)}")
     weights = np.concatenate([weight for weight, _ in layers])
     biases = [np.zeros(len(weight)) if bias is None else bias for weight, bias in layers]
     return weights, np.concatenate(biases)

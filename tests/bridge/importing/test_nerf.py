@@ -465,7 +465,7 @@ BROKEN = {
     "no frequencies": (with_shape("pts_linears.0.weight", 16, 14), "6 for each frequency, found 14"),
     "features of another width": (
         with_shape("feature_linear.weight", 16, 12),
-        "read as many numbers, found 16 ",
+        r"read as many numbers, found \[12, 16\]",
     ),
     "a vector": (with_shape("pts_linears.0.weight", 16), "should have shape"),
     "another bias": (with_shape("pts_linears.0.bias", 15), r"should have shape \[16\], found \[15\]"),
