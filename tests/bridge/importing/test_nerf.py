@@ -206,6 +206,7 @@ WRONG = {
     "no box": ((), "does not say where its scene lies; give the box as --aabb"),
     "no cameras": (("--near", 2, "--far", 6), "does not say where its scene lies"),
     "near beyond far": (("--near", 6, "--far", 2), "--near 6 should be less than --far 2"),
+    "two boxes": (("--aabb", "-1,-1,-1,1,1,1", "--far", 6), "leave out --near and --far"),
     "a box inside out": (("--aabb", "1,1,1,0,0,0"), "with each minimum below its maximum"),
 }
 
