@@ -28,7 +28,10 @@ from fusedrf_cli.errors import FusedRFError
 from fusedrf_cli.python import open_scene
 
 OURS = "answers.npz", "answers_background.npz", "view.npz"
-WORDS = {"krrish-nerf-hotdog": {"aabb": (-2.0, -2.0, -2.0, 2.0, 2.0, 2.0)}, "d2nerf": {"time": 2.0}}
+WORDS = {
+    "krrish-nerf-hotdog": {"aabb": (-2.0, -2.0, -2.0, 2.0, 2.0, 2.0)},
+    "d2nerf": {"time": 2.0, "aabb": (-6.0, -6.0, -6.0, 6.0, 6.0, 6.0)},
+}
 """What a folder's file does not say of itself."""
 FINER = 4
 
@@ -94,10 +97,11 @@ def pictures(folder: Path, bundle: Path, where: str) -> dict:
     truth = np.clip(np.load(folder / "view.npz")["rgb"].reshape(size, size, 3), 0, 1)
     behind = view["background"] if isinstance(view["background"], list) else (0, 0, 0)
     near = 0.0 if where or "dcvgo" in folder.name else view.get("near", 0.0)
+    far = np.inf if where else view.get("far", np.inf)
     found = []
     for finer in (1, FINER):
         step = sampling_step(field) / finer
-        shown = render_image(field, camera, origin=origin, near=near, step=step, early_stop=1e-6)
+        shown = render_image(field, camera, origin=origin, near=near, far=far, step=step, early_stop=1e-6)
         found.append(f"{psnr(shown.over(behind), truth):.1f}")
     return dict(zip(("picture, dB", "finer, dB"), found, strict=True))
 

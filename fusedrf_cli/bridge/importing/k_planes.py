@@ -29,7 +29,9 @@ from fusedrf_cli.engine.spaces import bounded, contracted_linf, space_of
 
 FIELD = "field."
 MOST_SAMPLES = 512  # vertices along an axis by which rays are sampled
-MARGIN = 1 / 3  # on each side of a box, of what has the values of its border
+REACH = 0.7
+"""How far around a box the values on its border go on, in its sides: about as far as cameras are followed
+that look at it from a few times its size away."""
 HIDDEN, BASIS_HIDDEN = 64, 128  # neurons of its networks
 GEOMETRY = 15  # features that the density's network makes for the colour
 SHIFT = -1.0  # of what is exponentiated
@@ -48,10 +50,10 @@ def read(checkpoint, time: float | None = None) -> Imported:
     elif time is not None:
         notes.append("its scene stands still: no time is needed")
     box, flipped, placement, space, scale = where(state)
-    margin = MARGIN if space is bounded and not settings.get("ndc") else 0.0
+    margin = REACH / (1 + 2 * REACH) if space is bounded and not settings.get("ndc") else 0.0
     if margin:
         notes.append(f"its box is {box.round(4).tolist()}, and around it the values on its border go on")
-        reach = (box[3:] - box[:3]) * margin / (1 - 2 * margin)
+        reach = REACH * (box[3:] - box[:3])
         box = box + np.concatenate([-reach, reach])
     features, width = grids[0][0].shape[-1], eight(grids[0][0].shape[-1])
     encoding, values = planes_of(grids, width, flipped)
