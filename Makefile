@@ -42,7 +42,7 @@ test-order: $(VENV)  ## the quick tests in random order, which is said and can b
 test-slow: $(VENV)  ## the slow tests, two files at a time, and how long each takes; SLOW=--third: a third of them
 	$(PYTHON) -m tests.slow $(SLOW)
 
-fuzz: $(VENV)  ## 10,000 hostile packs, captures and meshes, 1,000 by whole commands, 2,000 checkpoints of every other system, and 200 kills of every command; PACKS=, RUNS=, FOREIGN=, KILLS=, SEED=
+fuzz: $(VENV)  ## 10,000 hostile packs, captures and meshes, 1,000 by whole commands, 2,000 checkpoints of every other system and files of splats of each format, and 200 kills of every command; PACKS=, RUNS=, FOREIGN=, KILLS=, SEED=
 	$(PYTHON) -m tests.promises.fuzz --count $(PACKS) --seed $(SEED)
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PYTHON) -m tests.promises.commands --count $(RUNS) --seed $(SEED)
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PYTHON) -m tests.promises.fuzz_inputs --readers $(PACKS) --foreign $(FOREIGN) --commands $(RUNS) --seed $(SEED)

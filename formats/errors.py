@@ -241,6 +241,10 @@ class BadMesh(FormatError):
     """A mesh that cannot be loaded, or that has no surface."""
 
 
+class BadSplats(FormatError):
+    """A file of Gaussian splats that does not follow its format, or that holds none."""
+
+
 class MissingExtra(FormatError):
     """A library of an optional extra is not installed."""
 

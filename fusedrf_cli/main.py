@@ -16,8 +16,8 @@ from fusedrf_cli import __version__, options, signals, streams
 from fusedrf_cli.errors import FusedRFError
 
 COMMANDS = (
-    *("pose", "train", "compose", "fuse", "convert", "add", "delete", "move", "duplicate", "rename"),
-    *("replace", "crop", "tint", "extract", "history", "undo"),
+    *("pose", "train", "import", "compose", "fuse", "convert", "add", "delete", "move", "duplicate"),
+    *("rename", "replace", "crop", "tint", "extract", "history", "undo"),
     *("render", "eval", "chart", "info", "kinds", "validate", "completion"),
 )
 COMPLETE_VARIABLE = "_FUSEDRF_COMPLETE"

@@ -91,6 +91,13 @@ fused_precision = click.option(
     help="How numbers are stored; default: float16, for the kinds vm and sparse int8, or what the size "
     "asks for.",
 )
+imported_precision = click.option(
+    "--precision",
+    type=click.Choice(get_args(Precision)),
+    default="float32",
+    show_default=True,
+    help="How numbers are stored.",
+)
 ranks = click.option(
     "--ranks",
     type=RanksType(),

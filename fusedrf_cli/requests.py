@@ -131,6 +131,28 @@ class ConvertRequest(Writing, Learning, Sizing):
     kind: str
 
 
+@dataclass(frozen=True)
+class ImportRequest(Writing):
+    """Another system's file to a bundle."""
+
+    path: str
+    output: str
+    _: KW_ONLY
+    name: str | None = None
+    """Of the node; None: the file's stem."""
+    precision: Precision = "float32"
+    aabb: Box | None = None
+    """Of a field whose file does not say where it lies."""
+    near: Positive | None = None
+    far: Positive | None = None
+    """The distances from the cameras between which it lies, where there is no box."""
+    cameras: str | None = None
+    """The capture that the field was learnt from, whose cameras the bundle keeps."""
+    time: float | None = None
+    """That a moving scene is taken at."""
+    memory: Count | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class EditRequest(Writing):
     """A bundle that is changed; `fused` is read, and may be the output itself."""
@@ -351,6 +373,9 @@ class RenderRequest(Writing, Running):
     """Distance from a camera, in the world's units, from which what stands there is shown."""
     far: Positive = math.inf
     """Distance up to which it is shown."""
+    step: Positive | None = None
+    """How far samples of a ray lie apart, in the world's units where nothing is contracted; of several
+    fields, of the finest one. None: half the finest voxel."""
     size: Size | None = None
     background: Vector | None = (1.0, 1.0, 1.0)
     """None: transparent."""

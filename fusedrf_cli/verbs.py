@@ -23,8 +23,8 @@ from fusedrf_cli.request_parts import STDIO, ending_of
 from fusedrf_cli.requests import EditRequest, Writing
 
 __all__ = [
-    *("pose", "train", "compose", "fuse", "convert", "add", "delete", "move", "duplicate", "rename"),
-    *("replace", "crop", "tint", "extract", "history", "undo"),
+    *("pose", "train", "import_field", "compose", "fuse", "convert", "add", "delete", "move", "duplicate"),
+    *("rename", "replace", "crop", "tint", "extract", "history", "undo"),
     *("render", "eval", "chart", "info", "kinds", "validate"),
 ]
 
@@ -129,6 +129,7 @@ def _check_all(check: Callable, outputs: dict[str, bool], overwrite: bool) -> No
 
 pose = verb("pose", requests.PoseRequest)
 train = verb("train", requests.TrainRequest)
+import_field = verb("import_field", requests.ImportRequest, module="bridge.importing")
 compose = verb("compose", requests.ComposeRequest, module="files")
 fuse = verb("fuse", requests.FuseRequest)
 convert = verb("convert", requests.ConvertRequest)

@@ -19,19 +19,23 @@ MAX_DEPTH = 40
 AGAIN = "write it again"
 
 
-def read_beside(path: Path) -> object:
+def read_beside(path: Path) -> dict:
     """What a file of settings says, by the ending of its name. Raises FormatError."""
     data = read_input(path, MAX_BYTES)
-    if path.suffix == ".json":
-        return parse_json(data, str(path))
     try:
-        text = decoded(data)
-        value = READERS[path.suffix](text)
+        if path.suffix == ".json":
+            value = parse_json(data, "it")
+        else:
+            value = READERS[path.suffix](decoded(data))
     except FormatError as error:
         raise error.within(str(path)) from error
     except (ValueError, TypeError, yaml.YAMLError, SyntaxError, RecursionError, MemoryError) as error:
         shown = " ".join(str(error).split())[:200]
         raise BadCheckpoint(f"{path}: cannot be read as settings ({shown}); {AGAIN}") from error
+    if not isinstance(value, dict):
+        raise BadCheckpoint(
+            f"{path}: holds a {type(value).__name__}, expected settings by their names; {AGAIN}"
+        )
     check_plain(value, str(path))
     return value
 

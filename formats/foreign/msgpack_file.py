@@ -13,9 +13,9 @@ from formats.foreign.stored import DTYPES, StoredTensor, check_plain, shape_of
 from formats.safe_input import MAX_BYTES, open_input, read_input
 
 GZIP = b"\x1f\x8b"
-MAX_RATIO = 100
+MAX_RATIO = 20
 """How often larger than its bytes a gzip stream may become, beyond FREE bytes."""
-FREE = 256 << 20
+FREE = 64 << 20
 PIECE = 1 << 20
 MAX_LENGTH = 1 << 14
 """Of a list or map, which is allocated before its items are read."""
@@ -61,22 +61,22 @@ def read_msgpack(path: Path | str) -> dict:
     return value
 
 
-def _unzipped(path: Path | str) -> bytes:
-    pieces, size = [], 0
+def _unzipped(path: Path | str) -> bytearray:
+    data = bytearray()
     with open_input(path) as file:
         limit = min(MAX_BYTES, max(FREE, MAX_RATIO * file.seek(0, 2)))
         file.seek(0)
         try:
             with gzip.GzipFile(fileobj=file) as stream:
                 while piece := stream.read(PIECE):
-                    pieces.append(piece)
-                    if (size := size + len(piece)) > limit:
+                    data += piece
+                    if len(data) > limit:
                         raise LimitExceeded(
                             f"{path}: unpacks to more than {limit:,} bytes, which is not believed"
                         )
         except (OSError, EOFError, zlib.error) as error:
             raise BadCheckpoint(f"{path}: its gzip stream is damaged or cut short ({error})") from error
-    return b"".join(pieces)
+    return data
 
 
 class _Count:

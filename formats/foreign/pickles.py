@@ -14,6 +14,11 @@ from formats.foreign.stored import MAX_KEY_BITS
 MAX_BYTES = 256 << 20
 MAX_INSTRUCTIONS = 500_000
 MAX_INTEGER_BYTES = 16
+FREE_WORK = 1 << 20
+WORK_PER_BYTE = 8
+"""Bytes of arguments that values may be made of, for each byte of the pickle and beyond FREE_WORK: what a
+pickle holds once can be an argument of many calls."""
+ITEM_WORK = 16
 CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
 EMPTY = {"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple}
 VALUES = frozenset(
@@ -54,12 +59,14 @@ def read_pickle(
     dictionaries may be shared; only `stored.check_plain` tells that nothing but plain values is left in them.
     Raises BadCheckpoint, NeedsCode, LimitExceeded.
     """
-    machine = _Machine(known, persistent)
+    machine, start = _Machine(known, persistent), file.tell()
     try:
-        for count, (name, argument) in enumerate(_instructions(file, end)):
+        for count, (name, argument, position) in enumerate(_instructions(file, end)):
             if count == MAX_INSTRUCTIONS:
                 raise LimitExceeded(f"its pickle has more than {MAX_INSTRUCTIONS:,} instructions")
             machine.do(name, argument)
+            if machine.work > FREE_WORK + WORK_PER_BYTE * (position - start):
+                raise LimitExceeded("its pickle makes large values of few bytes")
         (value,) = machine.stack
     except FormatError:
         raise
@@ -68,9 +75,9 @@ def read_pickle(
     return value
 
 
-def _instructions(file: BinaryIO, end: int) -> Iterator[tuple[str, object]]:
-    for code, argument, _ in pickletools.genops(_Stream(file, min(end, file.tell() + MAX_BYTES))):
-        yield code.name, argument
+def _instructions(file: BinaryIO, end: int) -> Iterator[tuple[str, object, int]]:
+    for code, argument, position in pickletools.genops(_Stream(file, min(end, file.tell() + MAX_BYTES))):
+        yield code.name, argument, position
 
 
 class _Stream:
@@ -94,6 +101,7 @@ class _Machine:
         self.stack: list = []
         self.marks: list[int] = []
         self.memo: dict[int, object] = {}
+        self.work = 0
 
     def do(self, name: str, argument: object) -> None:
         """Carry out one instruction."""
@@ -185,12 +193,14 @@ class _Machine:
         made_of, arguments = self.taken(2)
         if not isinstance(made_of, Named) or type(arguments) is not tuple:
             raise NeedsCode(f"needs code to load: its pickle calls a {type(made_of).__name__}")
+        self.work += _size(arguments)
         self.stack.append(made_of.make(arguments))
 
     def build(self, _: None) -> None:
         (state,) = self.taken(1)
         (value,) = self.stack[-1:]
         if isinstance(value, Pending):
+            self.work += _size(state)
             value.build(state)
         elif type(value) is not dict:  # what a subclass of dict keeps beside its items is not asked for
             raise NeedsCode(f"needs code to load: its pickle sets the state of a {type(value).__name__}")
@@ -219,6 +229,14 @@ ACTIONS = {
     "BUILD": _Machine.build,
     "BINPERSID": _Machine.persistent_id,
 }
+
+
+def _size(arguments: object) -> int:
+    """About how many bytes the values of a tuple have."""
+    texts = sum(len(value) for value in arguments if isinstance(value, str | bytes))
+    return texts + ITEM_WORK * sum(
+        len(value) for value in arguments if isinstance(value, list | tuple | dict)
+    )
 
 
 def set_item(table: dict, key: object, value: object) -> None:

@@ -3,7 +3,9 @@
 import fnmatch
 import re
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,6 +35,8 @@ FOLDERS = ("nerfstudio_models", "checkpoints")
 """Folders of a run that hold its checkpoints."""
 MAX_FILES = 2000
 MAX_TRIED = 50
+MAX_NAMES = 50_000
+"""Names of a checkpoint that its system is told by."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class Checkpoint:
     system: str
     entries: dict
     path: Path
-    beside: dict[str, object] = field(default_factory=dict)
+    beside: dict[str, dict] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 
@@ -67,10 +71,12 @@ def open_checkpoint(path: Path | str) -> Checkpoint:
     LimitExceeded, NewerVersion, OlderVersion, MissingFile, NotAFile, ResourceError.
     """
     path = Path(path)
+    if path.name == "config.yml" and (path.parent / FOLDERS[0]).is_dir():  # how nerfstudio names a run
+        path = path.parent
     if path.is_dir():
         return _of_folder(path)
     entries = _entries(path)
-    names = _names(entries)
+    names = list(islice(_names(entries), MAX_NAMES))
     system = next((name for name, system in SYSTEMS.items() if _fits(system.rule, names)), None)
     if system is None:
         raise UnknownCheckpoint(
@@ -183,17 +189,14 @@ def _check_snapshot(snapshot: dict, path: Path) -> None:
 # --- systems ------------------------------------------------------------------------------------------------
 
 
-def _names(entries: dict, levels: int = 4) -> list[str]:
-    """Paths "a/b/c" of the dictionaries, tensors and binaries in the first levels, tensors as "a/b:2x3"."""
-    names = []
+def _names(entries: dict, levels: int = 4) -> Iterator[str]:
+    """Paths "a/b/c:" of the dictionaries, tensors and binaries in the first levels, with sizes: "a:2x3"."""
     for key, value in entries.items():
-        if "/" in str(key) or not isinstance(value, dict | StoredTensor | bytes):
+        if "/" in str(key) or len(str(key)) > 200 or not isinstance(value, dict | StoredTensor | bytes):
             continue
-        size = "x".join(map(str, value.shape)) if isinstance(value, StoredTensor) else ""
-        names.append(f"{key}:{size}")
+        yield f"{key}:{'x'.join(map(str, value.shape)) if isinstance(value, StoredTensor) else ''}"
         if isinstance(value, dict) and levels > 1:
-            names += [f"{key}/{name}" for name in _names(value, levels - 1)]
-    return names
+            yield from (f"{key}/{name}" for name in _names(value, levels - 1))
 
 
 def _fits(rule: str, names: list[str]) -> bool:

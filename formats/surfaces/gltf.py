@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.errors import BadMesh, LimitExceeded, MissingExtra, listed
-from formats.rotations import matrices
+from formats.errors import BadMesh, MissingExtra, listed
 from formats.safe_input import read_input
 from formats.surfaces import gltf_schema as schema
 from formats.surfaces.accessors import MESHOPT, Buffers, normalised
@@ -25,6 +24,7 @@ from formats.surfaces.gltf_materials import (
     Materials,
     Slot,
 )
+from formats.surfaces.gltf_nodes import INSTANCING, VISIBILITY, Nodes
 from formats.surfaces.named_files import Beside
 from formats.surfaces.surface import (
     Notes,
@@ -36,8 +36,6 @@ from formats.surfaces.surface import (
     sound_colours,
 )
 
-INSTANCING = "EXT_mesh_gpu_instancing"
-VISIBILITY = "KHR_node_visibility"
 KNOWN = {
     DRACO,
     *MESHOPT,
@@ -61,21 +59,20 @@ WITHOUT_LOOKS = {
 MAX_FILE = 2**32
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 TRIANGLES, STRIP, FAN = 4, 5, 6
-MAX_INSTANCES = 1_000_000
 SKINNED_AT_ONCE = 1 << 16
 
 
 def read_gltf(path: Path | str, notes: Notes) -> list[Surface]:
     """All triangles of the shown scene. Raises BadJson, BadMesh, LimitExceeded, MissingExtra, MissingFile,
     OutsideFolder."""
-    document, binary = _document(path)
-    _check_extensions(document, path, notes)
+    document, binary = read_document(path, read_input(path, MAX_FILE))
+    check_extensions(document, path, notes, KNOWN)
     buffers = Buffers(document, path, Beside(path), binary)
     return _Reader(document, path, buffers, notes).surfaces()
 
 
-def _document(path: Path | str) -> tuple[schema.Document, bytes | None]:
-    data = read_input(path, MAX_FILE)
+def read_document(path: Path | str, data: bytes) -> tuple[schema.Document, memoryview | None]:
+    """The JSON of a .gltf or .glb, and the binary chunk of a .glb. Raises BadJson, BadMesh, LimitExceeded."""
     if not data.startswith(b"glTF"):
         return schema.decode(data, str(path)), None
     if len(data) < 12:
@@ -102,15 +99,15 @@ def _chunks(data: bytes, path: Path | str) -> Iterator[tuple[int, memoryview]]:
         at += 8 + length
 
 
-def _check_extensions(document: schema.Document, path: Path | str, notes: Notes) -> None:
+def check_extensions(document: schema.Document, path: Path | str, notes: Notes, known: set[str]) -> None:
+    """Raises BadMesh where one is required that is not `known`; others are notes."""
+
     def unknown(names):
-        return [name for name in names if name not in KNOWN | WITHOUT_LOOKS]
+        return [name for name in names if name not in known | WITHOUT_LOOKS]
 
     required = [name for name in unknown(document.extensions_required) if not name.startswith(COLOUR_ONLY)]
     if required:
-        raise BadMesh(
-            f"{path}: requires {listed(required)}, which is not known here; export the mesh without it"
-        )
+        raise BadMesh(f"{path}: requires {listed(required)}, which is not known here; export it without that")
     owners = [document, *document.nodes, *document.meshes]
     owners += [primitive for mesh in document.meshes for primitive in mesh.primitives]
     there = [name for owner in owners for name in owner.extensions]
@@ -124,96 +121,32 @@ class _Reader:
     def __init__(self, document: schema.Document, path: Path | str, buffers: Buffers, notes: Notes):
         self.document, self.path, self.buffers, self.notes = document, path, buffers, notes
         self.materials = Materials(document, buffers, notes)
-        self.left_out = self.hidden = 0
-        self.worlds: list[np.ndarray] = []
+        self.nodes = Nodes(document, path, buffers, notes)
+        self.left_out = 0
         self.triangles = 0
         self.shapes: dict[tuple[int, int], _Shape] = {}
 
     def surfaces(self) -> list[Surface]:
-        self.worlds, order = self._worlds()
-        shown, surfaces = self._shown(order), []
-        for index in shown:
+        surfaces = []
+        for index in self.nodes.shown:
             if self.document.nodes[index].mesh is not None:
                 surfaces += self._node(index)
-        self._tell(shown)
+        self._tell()
         return [surface for surface in surfaces if len(surface.faces)]
 
-    def _tell(self, shown: list[int]) -> None:
-        document = self.document
+    def _tell(self) -> None:
         if self.left_out:
             self.notes.add(f"{self.left_out} primitives of points or lines are left out")
-        if document.animations:
-            self.notes.add(
-                f"{len(document.animations)} animations are not played; nodes and weights are as stored"
-            )
-        meshes = [document.nodes[index].mesh for index in shown if document.nodes[index].mesh is not None]
-        placed = set(meshes)
-        hidden = [mesh.name or f"mesh {i}" for i, mesh in enumerate(document.meshes) if i not in placed]
-        stray = sum(node.mesh in placed for node in document.nodes) - len(meshes)
-        if stray and len(document.scenes) < 2 and not self.hidden:
-            self.notes.add(f"{stray} nodes with meshes that are shown elsewhere are not in the shown scene")
-        if hidden:
-            self.notes.add(f"meshes that are not in the shown scene: {listed(hidden)}")
+        self.nodes.tell()
         self.materials.tell_unused()
 
     # --- nodes ----------------------------------------------------------------------------------------------
-
-    def _worlds(self) -> tuple[list[np.ndarray], list[int]]:
-        """node_to_world (4, 4) of every node, and the nodes with parents before their children."""
-        nodes = self.document.nodes
-        parents: list[int | None] = [None] * len(nodes)
-        for index, node in enumerate(nodes):
-            for child in node.children:
-                self.buffers.item("nodes", child)
-                if parents[child] is not None:
-                    raise BadMesh(f"{self.path}: node {child} has two parents; export the file again")
-                parents[child] = index
-        order = [index for index, parent in enumerate(parents) if parent is None]
-        for index in order:  # grows while it is walked
-            order.extend(nodes[index].children)
-        if len(order) < len(nodes):
-            raise BadMesh(f"{self.path}: nodes are their own children; export the file again")
-        worlds = [np.eye(4)] * len(nodes)
-        for index in order:
-            parent = parents[index]
-            local = _local(nodes[index])
-            worlds[index] = local if parent is None else worlds[parent] @ local
-        return worlds, order
-
-    def _shown(self, order: list[int]) -> list[int]:
-        """Nodes of the default scene, without those that are hidden."""
-        document = self.document
-        if document.scene is None and not document.scenes:
-            roots = set(order) - {child for node in document.nodes for child in node.children}
-        else:
-            chosen = document.scene or 0
-            scene = self.buffers.item("scenes", chosen)
-            roots = set(scene.nodes)
-            if len(document.scenes) > 1:
-                others = [s.name or f"scene {i}" for i, s in enumerate(document.scenes) if i != chosen]
-                self.notes.add(f"shows {scene.name or f'scene {chosen}'}; not shown: {listed(others)}")
-        for root in roots:
-            self.buffers.item("nodes", root)
-        within, shown = set(roots), []
-        for index in order:
-            if index not in within:
-                continue
-            node = document.nodes[index]
-            visibility = node.extension(VISIBILITY, schema.Visibility, self.path)
-            if visibility is not None and not visibility.visible:
-                self.hidden += 1
-                continue
-            within.update(node.children)
-            shown.append(index)
-        if self.hidden:
-            self.notes.add(f"{self.hidden} nodes are hidden by {VISIBILITY} and left out")
-        return shown
 
     def _node(self, index: int) -> list[Surface]:
         node = self.document.nodes[index]
         mesh = self.buffers.item("meshes", node.mesh)
         weights = mesh.weights if node.weights is None else node.weights
-        worlds = self._instances(node, self.worlds[index])
+        worlds = self.nodes.instances(index)
         surfaces = []
         for number, primitive in enumerate(mesh.primitives):
             where = f"{self.path}: mesh {mesh.name[:60] or node.mesh!r}, primitive {number}"
@@ -228,33 +161,12 @@ class _Reader:
             surfaces += shape.placed(worlds, weights, node.skin)
         return surfaces
 
-    def _instances(self, node: schema.Node, world: np.ndarray) -> list[np.ndarray]:
-        instancing = node.extension(INSTANCING, schema.Instancing, self.path)
-        if instancing is None:
-            return [world]
-        given = {
-            name: self.buffers.numbers(instancing.attributes[name], (width,)).astype(np.float64)
-            for name, width in (("TRANSLATION", 3), ("ROTATION", 4), ("SCALE", 3))
-            if name in instancing.attributes
-        }
-        counts = {len(rows) for rows in given.values()}
-        if len(counts) != 1:
-            raise BadMesh(f"{self.path}: {INSTANCING} counts {sorted(counts)} instances, expected one number")
-        n = counts.pop()
-        if n > MAX_INSTANCES:
-            raise LimitExceeded(f"{self.path}: {n:,} instances, at most {MAX_INSTANCES:,} are read")
-        local = np.tile(np.eye(4), (n, 1, 1))
-        local[:, :3, :3] = _rotations(given.get("ROTATION", np.tile([0.0, 0, 0, 1], (n, 1))))
-        local[:, :3, :3] *= given.get("SCALE", np.ones((n, 3)))[:, None]
-        local[:, :3, 3] = given.get("TRANSLATION", np.zeros((n, 3)))
-        return list(world @ local)
-
     def joints(self, index: int) -> np.ndarray:
         """(n_joints, 4, 4) from the mesh at rest to the world."""
         skin = self.buffers.item("skins", index)
         for joint in skin.joints:
             self.buffers.item("nodes", joint)
-        worlds = np.array([self.worlds[joint] for joint in skin.joints]).reshape(-1, 4, 4)
+        worlds = np.array([self.nodes.worlds[joint] for joint in skin.joints]).reshape(-1, 4, 4)
         if skin.inverse_bind_matrices is None:
             return worlds
         inverse = self.buffers.numbers(skin.inverse_bind_matrices, (16,)).astype(np.float64)
@@ -425,23 +337,3 @@ def _triangles(indices: np.ndarray, mode: int) -> np.ndarray:
         faces[1::2] = faces[1::2, [0, 2, 1]]
         return faces
     return np.stack([indices[1:-1], indices[2:], np.full(len(indices) - 2, indices[0])], 1)
-
-
-def _local(node: schema.Node) -> np.ndarray:
-    """node_to_parent."""
-    if node.matrix is not None:
-        return np.array(node.matrix).reshape(4, 4).T
-    local = np.eye(4)
-    if node.rotation is not None:
-        local[:3, :3] = _rotations(np.array([node.rotation]))[0]
-    if node.scale is not None:
-        local[:3, :3] *= node.scale
-    if node.translation is not None:
-        local[:3, 3] = node.translation
-    return local
-
-
-def _rotations(quaternions: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) of (n, 4) xyzw of any length; none where it is zero."""
-    lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return matrices(np.where(lengths > 0, quaternions / np.maximum(lengths, 1e-300), [0, 0, 0, 1]))

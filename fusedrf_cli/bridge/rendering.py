@@ -72,6 +72,7 @@ def render(request: RenderRequest, progress) -> dict:
         warn_of_work(request.scene, field, rays_of(views), progress)
         progress.phase("rendering", len(views))
         how = {"origin": origin, "near": request.near, "far": request.far}
+        how["step"] = None if request.step is None else request.step / unit_of(origin)
         shooting = _Shooting(field, how, request.background, request.depth, progress)
         if suffix in FILMS:
             write_film(output, shooting.frames(views), request.fps)
@@ -87,6 +88,11 @@ def render(request: RenderRequest, progress) -> dict:
         "size": [views[0].width, views[0].height],
         "memory": budget.report(),
     }
+
+
+def unit_of(origin: np.ndarray) -> float:
+    """How long a unit of a frame is in the world, where the frame lies at `origin` (see `render_image`)."""
+    return float(np.cbrt(abs(np.linalg.det(origin[:3, :3])))) if origin.shape == (4, 4) else 1.0
 
 
 def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:

@@ -48,6 +48,12 @@ from fusedrf_cli.requests import RenderRequest
 @click.option(
     "--far", type=PositiveType(), metavar="D", help="Leave out what is farther from the camera than D."
 )
+@click.option(
+    "--step",
+    type=PositiveType(),
+    metavar="LENGTH",
+    help="How far samples of a ray lie apart; default: half a voxel.",
+)
 @options.size
 @click.option(
     "--background",

@@ -1,8 +1,8 @@
 """Damaged captures, meshes, scenes and checkpoints: `python -m tests.promises.fuzz_inputs --seed 0`.
 
 `--readers N` mutates N inputs and has the readers read them in this process, `--foreign N` as many of each
-format of other systems' checkpoints. `--commands N` has whole commands work on N of them, each in a child
-(commands.py). An input is wrong if it ended in anything but an
+format of other systems' checkpoints, `--splats N` of splats (splat_inputs.py). `--commands N` has whole
+commands work on N of them, each in a child (commands.py). An input is wrong if it ended in anything but an
 error of the program's own, took too long or too much memory, did not end when it was asked to, or left a
 temporary. Every input follows from (seed, index).
 """
@@ -43,6 +43,7 @@ from tests.promises.fuzz import patience as patiently
 from tests.promises.inputs import CAPTURES, MESHES
 from tests.promises.kills import forked
 from tests.promises.mutations import DAMAGES, EDGES, TOKENS, spoilt_json
+from tests.promises.splat_inputs import splats
 
 MAX_MB = 500
 """Of memory that reading one small input may take."""
@@ -293,12 +294,14 @@ def main() -> int:
     parser.add_argument("--readers", type=int, default=10_000)
     parser.add_argument("--foreign", type=int, default=2_000)
     parser.add_argument("--commands", type=int, default=500)
+    parser.add_argument("--splats", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     found = {}
     for tried, count in (
         (readers, options.readers),
         (foreign, options.foreign),
+        (splats, options.splats),
         (commands, options.commands),
     ):
         if count:

@@ -24,6 +24,13 @@ def test_damaged_captures_and_meshes_are_read_or_refused(tmp_path):
     assert {key.rpartition(" ")[2] for key in result["counts"]} == {"read", "refused"}
 
 
+def test_damaged_checkpoints_of_other_systems_are_read_or_refused(tmp_path):
+    """P18; `make fuzz` takes 2,000 of each."""
+    result = fuzz_inputs.foreign(10, 0, tmp_path)
+    assert result["wrong"] == [] and result["inputs"] == 10 * 16
+    assert {key.rpartition(" ")[2] for key in result["counts"]} == {"read", "refused"}
+
+
 def test_a_reader_that_breaks_down_is_seen(tmp_path, monkeypatch):
     monkeypatch.setattr(fuzz_inputs, "load_photos", lambda views: 1 / 0)
     assert any("ZeroDivisionError" in one["problem"] for one in fuzz_inputs.readers(30, 0, tmp_path)["wrong"])
@@ -32,6 +39,6 @@ def test_a_reader_that_breaks_down_is_seen(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_commands_over_damaged_inputs_end_with_a_sentence():
     """P14, P18, and SIGTERM: by whole commands, in a process of their own, since it forks."""
-    words = ("--readers", "0", "--commands", "60", "--seed", "1")
+    words = ("--readers", "0", "--foreign", "0", "--splats", "0", "--commands", "60", "--seed", "1")
     done = subprocess.run([sys.executable, "-m", "tests.promises.fuzz_inputs", *words], cwd=ROOT)
     assert done.returncode == 0

@@ -1,0 +1,137 @@
+"""`import`: another system's file to a bundle of its own numbers."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+from formats.bundle import BundleWriter
+from formats.camera_set import capture_camera_set
+from formats.captures import read_capture
+from formats.errors import FormatError
+from formats.foreign.stored import StoredTensor
+from formats.foreign.systems import SYSTEMS, Checkpoint, open_checkpoint
+from formats.graph import free_name, placement_of
+from formats.records import FieldRecord
+from formats.scene import SceneGraph, make_node
+from formats.views import Capture
+from fusedrf_cli import __version__
+from fusedrf_cli.bridge.importing.parts import Imported
+from fusedrf_cli.bridge.memory import Memory
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.spaces import bounded
+from fusedrf_cli.errors import InvalidInput, UsageProblem
+from fusedrf_cli.requests import ImportRequest
+
+READERS = {
+    "tensorf": ("tensorf", "read"),
+    "svox2": ("svox2", "read"),
+    "dvgo": ("dvgo", "read"),
+    "dcvgo": ("dvgo", "read"),
+    "torch-ngp": ("torch_ngp", "read"),
+    "pvd": ("torch_ngp", "read_pvd"),
+    "instant-ngp": ("instant_ngp", "read"),
+    "nerfacto": ("nerfacto", "read"),
+    "nerf-pytorch": ("nerf", "read"),
+    "krrish-nerf": ("nerf", "read_krrish"),
+}
+"""The module and the function that read a system's checkpoint."""
+BOXLESS = "nerf-pytorch", "krrish-nerf"
+"""Systems whose files have no box."""
+COPIES = 4.0
+"""Of an array, of what its field takes: read, rearranged, as numbers and as they are written."""
+
+
+def import_field(request: ImportRequest, progress) -> dict:
+    """Write what a file of another system holds."""
+    progress.phase("reading", None)
+    memory = Memory(request.memory)
+    checkpoint = open_checkpoint(request.path)
+    if checkpoint.system not in READERS:
+        known = ", ".join(SYSTEMS[name].title for name in READERS)
+        raise InvalidInput(
+            f"{checkpoint.path}: a checkpoint of {SYSTEMS[checkpoint.system].title}, which is not read; "
+            f"read are those of {known}"
+        )
+    capture = None if request.cameras is None else read_capture(request.cameras)
+    parts = {"the field": COPIES * bytes_of(checkpoint.entries)}
+    memory.expect(parts, advice="close other programs, or raise --memory")
+    imported = imported_from(checkpoint, request, capture)
+    progress.phase("writing", None)
+    graph = write(imported, request, capture)
+    notes = [*checkpoint.notes, *imported.notes]
+    return {
+        "output": request.output,
+        "bytes": Path(request.output).stat().st_size,
+        "system": SYSTEMS[checkpoint.system].title,
+        "fields": [
+            {"name": leaf.name, "kind": field.kind, **registry.kind(field.kind).describe(field)}
+            for leaf, field in zip(graph.leaves(), (n.field for n in imported.nodes), strict=True)
+        ],
+        "notes": notes,
+        "memory": memory.report(),
+    }
+
+
+def bytes_of(entries: object) -> float:
+    """Of the arrays that a field may be made of: what optimisers keep is never read."""
+    if isinstance(entries, StoredTensor):
+        return 4.0 * np.prod(entries.shape, dtype=float)
+    if isinstance(entries, dict):
+        return sum(bytes_of(value) for key, value in entries.items() if "optim" not in str(key))
+    return float(len(entries)) if isinstance(entries, bytes) else 0.0
+
+
+def imported_from(checkpoint: Checkpoint, request: ImportRequest, capture: Capture | None) -> Imported:
+    """What the file holds. Raises InvalidInput naming the file."""
+    module, function = READERS[checkpoint.system]
+    read: Callable[..., Imported] = getattr(import_module(f"{__name__}.{module}"), function)
+    boxless = checkpoint.system in BOXLESS
+    if not boxless and (request.aabb or request.near or request.far):
+        raise UsageProblem("--aabb, --near and --far are for files without a box, and this one has its own")
+    box = [box_of(request, capture)] if boxless else []
+    try:
+        return read(checkpoint, *box)
+    except (FormatError, ValueError) as error:
+        raise InvalidInput(f"{checkpoint.path}: {error}") from error
+
+
+def box_of(request: ImportRequest, capture: Capture | None) -> np.ndarray:
+    """The box (6,) of a field whose file has none: as given, or what cameras see between two distances."""
+    if request.aabb is not None:
+        box = np.array(request.aabb)
+        if not (box[:3] < box[3:]).all():
+            raise UsageProblem(f"--aabb should be three minima below three maxima, found {request.aabb}")
+        return box
+    if capture is None or request.near is None or request.far is None:
+        raise UsageProblem(
+            f"{request.path} does not say where its scene lies; give the box as --aabb "
+            "xmin,ymin,zmin,xmax,ymax,zmax, or --near, --far and the capture as --cameras"
+        )
+    if not request.near < request.far:
+        raise UsageProblem(f"--near {request.near:g} should be less than --far {request.far:g}")
+    views = capture.train + capture.test
+    corners = np.concatenate([view.corners(t) for view in views for t in (request.near, request.far)])
+    return np.concatenate([corners.min(0), corners.max(0)])
+
+
+def write(imported: Imported, request: ImportRequest, capture: Capture | None) -> SceneGraph:
+    """Write the bundle; its scene graph."""
+    writer, nodes, names = BundleWriter(), [], set()
+    wanted = request.name or Path(request.path).stem
+    for node in imported.nodes:
+        member = writer.add_field(FieldRecord(node.field.kind, *node.field.state()), request.precision)
+        name = free_name(wanted + node.suffix, names)
+        nodes.append(make_node(name, field=member, **placement_of(node.object_to_world)))
+    if imported.rule != "max" and len(nodes) > 1:
+        group = make_node(free_name(wanted, names), children=tuple(nodes))
+        nodes = [replace(group, composition=imported.rule)]
+    cameras = None
+    if capture is not None:
+        unbounded = any(node.field.space is not bounded for node in imported.nodes)
+        cameras = capture_camera_set(capture, surroundings=unbounded).content()
+    graph = SceneGraph(tuple(nodes), generator=f"fusedrf {__version__}", cameras=cameras)
+    writer.write(request.output, graph, overwrite=request.overwrite)
+    return graph

@@ -1,5 +1,5 @@
-"""Occupancy grids as the files of Instant-NGP and of what is built on it have them: cascades of 128³ cells (or
-fewer), each twice as large as the one before, in Morton order."""
+"""Occupancy grids as the files of Instant-NGP and of what is built on it have them: cascades of 128³ cells,
+or fewer, each twice as large as the one before, in Morton order."""
 
 import numpy as np
 

@@ -101,8 +101,8 @@ def shading_of(
 
 
 def space_and_placement(kwargs: Entries, state: Entries, box: np.ndarray):
-    """The space that the grid lies in, and its frame's placement (4, 4): of contracted scenes the cube that is
-    not contracted is the frame's unit."""
+    """The space that the grid lies in, and its frame's placement (4, 4): of contracted scenes the cube
+    that is not contracted is the frame's unit."""
     if "scene_center" not in state.values:
         return bounded, np.eye(4)
     norm = kwargs.values.get("contracted_norm", "inf")
@@ -125,9 +125,7 @@ def cells_of(state: Entries, box: np.ndarray, space) -> OccupancyGrid:
     if "mask_cache.mask" not in state.values:
         return OccupancyGrid.full(box, space=space)
     mask = state.array("mask_cache.mask", None, None, None) > 0
-    scale, shift = (
-        state.array(f"mask_cache.xyz2ijk_{name}", 3).astype(np.float64) for name in ("scale", "shift")
-    )
+    scale, shift = (state.array(f"mask_cache.xyz2ijk_{n}", 3).astype(np.float64) for n in ("scale", "shift"))
     if not (scale > 0).all():
         raise FormatError("'mask_cache.xyz2ijk_scale' should be above 0")
     faces = [(-0.5 - shift) / scale, (np.array(mask.shape) - 0.5 - shift) / scale]

@@ -1,5 +1,5 @@
-"""nerfstudio's nerfacto (Tancik et al., SIGGRAPH 2023; github.com/nerfstudio-project/nerfstudio), computed by torch
-or by tiny-cuda-nn."""
+"""nerfstudio's nerfacto (Tancik et al., SIGGRAPH 2023; github.com/nerfstudio-project/nerfstudio), computed by
+torch or by tiny-cuda-nn."""
 
 from collections.abc import Mapping
 from typing import Any

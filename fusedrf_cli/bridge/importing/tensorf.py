@@ -1,4 +1,5 @@
-"""TensoRF's checkpoints (Chen et al., ECCV 2022; github.com/apchenstu/TensoRF): TensorVMSplit and TensorCP."""
+"""TensoRF's checkpoints (Chen et al., ECCV 2022; github.com/apchenstu/TensoRF), of TensorVMSplit and of
+TensorCP."""
 
 import numpy as np
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from formats.errors import FormatError
+from fusedrf_cli.bridge.importing import tensorf
 from fusedrf_cli.bridge.importing.cells import cells_of_bits
 from fusedrf_cli.bridge.importing.nerf import frequencies_of, joined, skipping
 from fusedrf_cli.bridge.importing.parts import (
@@ -161,13 +162,11 @@ def harmonic_network(model: Entries, outputs: int) -> tuple[dict, dict[str, np.n
 
 
 def factors(model: Entries, which: str) -> tuple[dict[str, np.ndarray], tuple, list[int]]:
-    """Planes and lines, laid out as TensoRF's (tensorf.py), by the names of our sections; texels per axis, and
-    ranks."""
+    """Planes and lines, laid out as TensoRF's (tensorf.py), by the names of our sections; texels per axis,
+    and ranks."""
     renamed = {
         f"app_{part}.{i}": model.get(f"{which}_{there}.{i}")
         for part, there in (("plane", "mat"), ("line", "vec"))
         for i in range(3)
     }
-    from fusedrf_cli.bridge.importing.tensorf import factors as of_tensorf
-
-    return of_tensorf(Entries(renamed), "app", True)
+    return tensorf.factors(Entries(renamed), "app", True)

@@ -103,6 +103,11 @@ def test_a_damaged_newest_checkpoint_is_not_passed_over(tmp_path):
         open_checkpoint(tmp_path)
 
 
+def test_a_run_of_nerfstudio_is_named_by_its_config(tmp_path):
+    path = write("nerfacto", tmp_path)
+    assert open_checkpoint(tmp_path / "config.yml").path == path
+
+
 def test_settings_that_cannot_be_read_are_noted(tmp_path):
     path = write("nerfacto", tmp_path)
     (tmp_path / "config.yml").write_text("a: [")

@@ -323,6 +323,25 @@ def test_endless_pickles_are_refused(tmp_path, monkeypatch):
     assert isinstance(refused(b"\x80\x02]" + b"K\1a" * 10_000 + b".", tmp_path / "a.pth"), LimitExceeded)
 
 
+PAIRS = b"](" + b"".join(b"]q\1(X\3\0\0\0%03dK\1e" % n for n in range(900)) + b"e"
+SHARED = {
+    "texts": (b"X\0\0\1\0" + b"a" * (1 << 16) + b"q\2", b"c_codecs\nencode\nh\2X\6\0\0\0latin1\x86R"),
+    "pairs": (PAIRS + b"q\2", b"ccollections\nOrderedDict\nh\2\x85R"),
+    "arrays": (
+        b"C\0q\3X\0\0\1\0" + b"a" * (1 << 16) + b"q\2",
+        ARRAY + b"(K\1M\0\x40\x85" + FLOAT + b"\x89h\2tb",
+    ),
+    "sizes": (b"](" + b"K\1" * 1000 + b"eq\2", b"ctorch\nSize\nh\2\x85R"),
+}
+
+
+@pytest.mark.parametrize("name", SHARED)
+def test_many_values_made_of_one_argument_are_refused(name, tmp_path):
+    shared, call = SHARED[name]
+    error = refused(b"\x80\x02(" + shared + call * 20_000 + b"t.", tmp_path / "a.pth")
+    assert isinstance(error, LimitExceeded)
+
+
 @pytest.mark.parametrize("wrap", [list, tuple, lambda values: dict(zip("0123456789", values, strict=True))])
 def test_shared_containers_do_not_multiply(wrap, tmp_path):
     value = 1

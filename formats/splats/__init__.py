@@ -1,0 +1,1 @@
+"""Files of Gaussian splats. `reading.py` tells which of the formats a file is, and reads it."""

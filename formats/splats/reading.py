@@ -1,0 +1,68 @@
+"""Which format of splats a file has, told by its content and never by its name; and its splats."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from formats.errors import BadSplats
+from formats.ply_elements import MAX_HEADER
+from formats.safe_input import open_input, read_input
+from formats.splats.dot_splat import is_splat, read_splat
+from formats.splats.gltf import names_splats, read_gltf_splats
+from formats.splats.ksplat import is_ksplat, read_ksplat
+from formats.splats.ply import is_ply, read_ply
+from formats.splats.sog import is_meta, is_sog, read_sog
+from formats.splats.splats import MAX_FILE, Splats
+from formats.splats.spz import is_spz, read_spz
+
+HEAD = max(MAX_HEADER, 1 << 17)
+"""Bytes of a file that are looked at first."""
+MAX_JSON = 64 << 20
+GIVE = "a .ply of 3DGS, .spz, .sog, .splat, .ksplat or .glb"
+
+
+def is_splats(path: Path | str) -> bool:
+    """Whether a file holds Gaussian splats in a format that is read. Raises MissingFile, NotAFile,
+    ResourceError."""
+    return _reader(path) is not None
+
+
+def read_splats(path: Path | str) -> Splats:
+    """The splats of a .ply (plain or compressed), .spz, .sog, .splat, .ksplat, .gltf or .glb. Raises
+    BadSplats, LimitExceeded, NewerVersion, MissingFile, NotAFile, ResourceError; of glTF also what
+    `read_gltf` raises."""
+    reader = _reader(path)
+    if reader is None:
+        raise BadSplats(f"{path}: holds no Gaussian splats that can be read; give {GIVE}")
+    with np.errstate(all="ignore"):  # numbers that are none or beyond any measure are left out, and told
+        return reader(path, read_input(path, MAX_FILE))
+
+
+@np.errstate(all="ignore")
+def _reader(path: Path | str) -> Callable[[Path | str, bytes], Splats] | None:
+    with open_input(path) as file:
+        head, size = file.read(HEAD), os.fstat(file.fileno()).st_size
+    if is_ply(head):
+        return read_ply
+    if is_spz(head):
+        return read_spz
+    if names_splats(_json(path, head)):
+        return read_gltf_splats
+    if is_sog(path) if head.startswith(b"PK\3\4") else is_meta(head):
+        return read_sog
+    if is_ksplat(head, size):
+        return read_ksplat
+    return read_splat if is_splat(head, size) else None
+
+
+def _json(path: Path | str, head: bytes) -> bytes:
+    """The JSON of a .glb or .gltf, or of any file that begins so, up to MAX_JSON; nothing of others."""
+    binary = head.startswith(b"glTF")
+    if not binary and head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] != b"{":
+        return b""
+    start, length = (20, int.from_bytes(head[12:16], "little")) if binary else (0, MAX_JSON)
+    with open_input(path) as file:
+        file.seek(start)
+        return file.read(min(length, MAX_JSON))

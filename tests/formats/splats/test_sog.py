@@ -1,0 +1,127 @@
+"""SOG: zips and folders, old and new, and what is wrong with them."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+from formats.errors import BadJson, BadSplats, FormatError, LimitExceeded, MissingFile, NewerVersion
+from formats.splats.reading import is_splats, read_splats
+from tests.formats.splats.writers import content, sog_files, webp, written, zipped
+
+
+def read(tmp_path, files: dict[str, bytes]):
+    return read_splats(written(tmp_path / "a.sog", zipped(files)))
+
+
+def changed(files: dict[str, bytes], **entries) -> dict[str, bytes]:
+    meta = json.loads(files["meta.json"])
+    return files | {"meta.json": json.dumps(meta | entries).encode()}
+
+
+def test_a_folder_of_pictures_and_a_zip_with_a_folder(tmp_path):
+    files = sog_files(content())
+    for name, data in files.items():
+        written(tmp_path / "scene" / name, data)
+    assert is_splats(tmp_path / "scene/meta.json")
+    loose = read_splats(tmp_path / "scene/meta.json")
+    for pack in (files, {f"scene/{name}": data for name, data in files.items()}):
+        assert np.array_equal(read(tmp_path, pack).centres, loose.centres)
+
+
+def test_a_codebook_whose_first_entry_is_missing(tmp_path):
+    """As the engine mends it: one step before the second entry."""
+    files = sog_files(content())
+    meta = json.loads(files["meta.json"])
+    mended = meta["scales"]["codebook"]
+    mended[0] = mended[1] + (mended[1] - mended[255]) / 255
+    expected = read(tmp_path, changed(files, scales=meta["scales"]))
+    mended[0] = None
+    assert np.array_equal(read(tmp_path, changed(files, scales=meta["scales"])).scales, expected.scales)
+
+
+def test_rotations_without_a_tag_are_none(tmp_path):
+    files = sog_files(content())
+    files["q.webp"] = webp(np.tile(np.uint8([200, 10, 30, 251]), (5, 1)))
+    assert read(tmp_path, files).rotations.tolist() == [[1, 0, 0, 0]] * 5
+
+
+def test_labels_beyond_the_palette_are_told(tmp_path):
+    files = sog_files(content())
+    files["n.webp"] = webp(np.tile(np.uint8([255, 255, 0]), (5, 1)))
+    splats = read(tmp_path, files)
+    assert not splats.harmonics[:, 1:].any() and "5 splats have no entry" in splats.notes[0]
+
+
+def test_antialiasing_is_told(tmp_path):
+    assert "antialiasing" in read(tmp_path, changed(sog_files(content()), model="antialiased")).notes[0]
+
+
+def test_newer_versions(tmp_path):
+    with pytest.raises(NewerVersion, match="version 3"):
+        read(tmp_path, changed(sog_files(content()), version=3))
+
+
+@pytest.mark.parametrize(
+    ("entries", "error"),
+    [
+        ({"count": 0}, BadSplats),
+        ({"count": -1}, BadSplats),
+        ({"count": 17}, BadSplats),
+        ({"count": 10**12}, LimitExceeded),
+        ({"means": {}}, BadSplats),
+        ({"scales": {"files": ["s.webp"]}}, BadSplats),
+        ({"quats": {"files": ["none.webp"]}}, BadSplats),
+        ({"quats": {"files": ["../q.webp"]}}, BadSplats),
+        ({"quats": {"files": ["meta.json"]}}, BadSplats),
+        ({"shN": {"files": ["l.webp", "u.webp"]}}, BadSplats),
+    ],
+)
+def test_what_meta_says_wrongly(entries, error, tmp_path):
+    with pytest.raises(error):
+        read(tmp_path, changed(sog_files(content()), **entries))
+
+
+def test_a_picture_that_is_none_or_too_large(tmp_path):
+    files = sog_files(content())
+    with pytest.raises(BadSplats, match="no WebP"):
+        read(tmp_path, files | {"q.webp": b"\x89PNG" + bytes(40)})
+    with pytest.raises(BadSplats, match="cannot be decoded"):
+        read(tmp_path, files | {"q.webp": files["q.webp"][:-20]})
+    with pytest.raises(LimitExceeded, match="3000x3000 pixels"):
+        read(tmp_path, files | {"q.webp": webp(np.zeros((9_000_000, 4), np.uint8), 3000)})
+
+
+def test_a_picture_that_a_zip_unpacks_to_far_more_than_it_has(tmp_path):
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as pack:
+        for name, data in sog_files(content()).items():
+            pack.writestr(name, data + bytes(64 << 20) if name == "q.webp" else data)
+    with pytest.raises(LimitExceeded, match="q.webp has 67,"):
+        read_splats(written(tmp_path / "a.sog", out.getvalue()))
+
+
+def test_names_do_not_lead_out_of_the_folder(tmp_path):
+    files = changed(sog_files(content()), quats={"files": ["/etc/hostname"]})
+    for name, data in files.items():
+        written(tmp_path / "scene" / name, data)
+    with pytest.raises(MissingFile):
+        read_splats(tmp_path / "scene/meta.json")
+
+
+def test_json_that_is_none(tmp_path):
+    with pytest.raises(BadJson):
+        read(tmp_path, sog_files(content()) | {"meta.json": b'{"means": '})
+
+
+def test_every_flipped_bit_of_a_picture_is_noticed(tmp_path):
+    """The checksums of the zip cover them."""
+    data = zipped(sog_files(content()))
+    start = data.index(b"RIFF")
+    for at in range(start, start + 60):
+        damaged = bytearray(data)
+        damaged[at] ^= 1 << at % 8
+        with pytest.raises(FormatError):
+            read_splats(written(tmp_path / "a.sog", bytes(damaged)))
