@@ -27,13 +27,15 @@ from fusedrf_cli.engine.encodings import (
     line,
     plane_line,
     planes,
+    sparse_grid,
+    spheres,
     trunk_features,
 )
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 from fusedrf_cli.engine.fields.box import MAX_ANSWER
 from fusedrf_cli.engine.kernels.assembled import READS, assemble
 
-ENCODINGS = plane_line, line, grid, hash_grid, planes, frequencies
+ENCODINGS = plane_line, line, grid, sparse_grid, spheres, hash_grid, planes, frequencies
 PARTS: dict[str, tuple[ModuleType, ...]] = {
     "density": ENCODINGS,
     "colour": (*ENCODINGS, trunk_features),
