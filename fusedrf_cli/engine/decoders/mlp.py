@@ -6,7 +6,8 @@ LAYERS rectified layers of HIDDEN outputs and one of three logits follow.
 TensoRF's MLP_Fea (Chen et al., ECCV 2022) has 27 rows, two frequencies and two layers; DVGO (Sun et al., CVPR
 2022) and NeRF (Mildenhall et al., ECCV 2020) read the features themselves, without rows; Instant-NGP (Müller
 et al. 2022, sec. 5.4) does with harmonics. DVGO may take the first three rows of B features as `diffuse`
-logits, which are added to the network's.
+logits, which are added to the network's. With `dimmed` f the feature of that number darkens the colour: it is
+sigmoid(logit) (1 - sigmoid(feature f)) (the shadows of D²NeRF, Wu et al., NeurIPS 2022, eq. 6).
 
 The inputs lie in blocks as wide as x, where others interleave frequencies, and encode features and direction
 by as many as they like: an importer permutes the columns of the first layer, and leaves 0 what is not there.
@@ -46,6 +47,8 @@ class Options(msgspec.Struct, forbid_unknown_fields=True):
     diffuse: bool = False
     limits: tuple[float, float] | None = None
     """Between which the rows of B features are kept."""
+    dimmed: Annotated[int, msgspec.Meta(ge=0, le=1024)] = 0
+    """0: none."""
 
 
 class Arrays(NamedTuple):
@@ -62,7 +65,7 @@ def core_of(width: int, rows: int, direction: str, point: bool) -> int:
 
 def layer_shapes(
     width: int, rows: int, hidden: int, layers: int = 2, frequencies: int = 2, direction: str = "raw",
-    point: bool = False, diffuse: bool = False, limits: tuple[float, float] | None = None,
+    point: bool = False, **shown,
 ) -> list[tuple[int, int]]:  # fmt: skip
     """(inputs, outputs) of each layer in memory: outputs are filled up to runs of eight with zeros."""
     wide = -(-hidden // 8) * 8
@@ -72,7 +75,7 @@ def layer_shapes(
 
 def sizes(
     width: int, rows: int, hidden: int, layers: int = 2, frequencies: int = 2, direction: str = "raw",
-    point: bool = False, diffuse: bool = False, limits: tuple[float, float] | None = None,
+    point: bool = False, diffuse: bool = False, limits: tuple[float, float] | None = None, dimmed: int = 0,
 ) -> dict[str, int | float]:  # fmt: skip
     """See decoders; scratch holds the direction and the point, and the gradients of the layers' outputs, of
     the input, of x and of the features. Features, input and the layers' outputs are kept."""
@@ -88,6 +91,7 @@ def sizes(
         "WIDTH": width, "BASIS": int(rows > 0), "ROWS": rows or width, "INPUTS": inputs, "HIDDEN": wide,
         "LAYERS": layers, "FREQUENCIES": frequencies, "CORE": core, "AS_HARMONICS": int(direction != "raw"),
         "DIRECTIONS": core - (rows or width) - 3 * point, "POINTS": 3 * point, "DIFFUSE": int(diffuse),
+        "DIMMED": dimmed,
         "LIMITED": int(limits is not None), "LOWEST": float((limits or (0, 0))[0]),
         "HIGHEST": float((limits or (0, 0))[1]),
         **dict(zip(rooms, starts, strict=False)), "ROOM": starts[-1],
@@ -113,7 +117,7 @@ def arrays(field, starts: np.ndarray, rows: int, **options) -> Arrays:
 def reference(
     field, sections: dict, features: torch.Tensor, dirs: torch.Tensor, unit: torch.Tensor, rows: int,
     layers: int = 2, frequencies: int = 2, direction: str = "raw", point: bool = False, diffuse: bool = False,
-    limits: tuple[float, float] | None = None, **options,
+    limits: tuple[float, float] | None = None, dimmed: int = 0, **options,
 ) -> torch.Tensor:  # fmt: skip
     """See decoders."""
     read = features @ sections["basis"].T if rows else features
@@ -125,12 +129,18 @@ def reference(
     for i in range(layers + 1):
         x = x @ sections[f"layer_{i}"][:-1] + sections[f"layer_{i}"][-1]
         x = x.relu() if i < layers else x[:, :3]
-    return x + read[:, :3] if diffuse else x
+    x = x + read[:, :3] if diffuse else x
+    return dimmed_by(x, features[:, dimmed, None]) if dimmed else x
+
+
+def dimmed_by(logits: torch.Tensor, shadow: torch.Tensor) -> torch.Tensor:
+    """The logit of sigmoid(logits) (1 - sigmoid(shadow)), as `dimmed_logit`."""
+    return -torch.logsumexp(torch.stack(torch.broadcast_tensors(-logits, shadow, shadow - logits)), 0)
 
 
 def bound(
     field, sections: dict, features: torch.Tensor, rows: int, layers: int = 2, diffuse: bool = False,
-    **options,
+    dimmed: int = 0, **options,
 ) -> float:  # fmt: skip
     """See decoders: x is bounded by B, and the network by the product of its layers' largest sums."""
     read = sections["basis"].abs().double() @ features if rows else features
@@ -138,7 +148,8 @@ def bound(
     for i in range(layers + 1):
         layer = sections[f"layer_{i}"].abs().double()
         most = float((layer[:-1].sum(0) * most + layer[-1]).max())
-    return most + float(read[:3].max()) * diffuse
+    most += float(read[:3].max()) * diffuse
+    return most + float(features[dimmed]) + 2 if dimmed else most
 
 
 # -- compiled ------------------------------------------------------------------------------------------------
@@ -181,10 +192,27 @@ def forward(field, cell, d, scratch, memory, at):
         dense(HIDDEN, HIDDEN, params, np.uint64(field.layers[layer]), memory, below, memory, h)
         rectify(HIDDEN, memory, h)
     dense(HIDDEN, OUTPUTS, params, np.uint64(field.layers[LAYERS]), memory, h, memory, last)
+    r, g, b = plain_logits_at(memory, x, last)
+    if DIMMED > 0:
+        shadow = memory[base + np.uint64(DIMMED)]
+        return dimmed_logit(r, shadow)[0], dimmed_logit(g, shadow)[0], dimmed_logit(b, shadow)[0]
+    return r, g, b
+
+
+def plain_logits_at(memory, x, last):
+    """The logits before they are dimmed, of what is kept."""
     r, g, b = memory[last], memory[last + np.uint64(1)], memory[last + np.uint64(2)]
     if DIFFUSE:
         return r + memory[x], g + memory[x + np.uint64(1)], b + memory[x + np.uint64(2)]
     return r, g, b
+
+
+def dimmed_logit(logit, shadow):
+    """-log(e^-logit + e^shadow + e^(shadow - logit)), and its derivatives by both."""
+    most = max(-logit, max(shadow, shadow - logit))
+    lit, dark, both = math.exp(-logit - most), math.exp(shadow - most), math.exp(shadow - logit - most)
+    total = lit + dark + both
+    return -most - math.log(total), (lit + both) / total, -(dark + both) / total
 
 
 def encode(memory, x):
@@ -208,6 +236,9 @@ def backward(field, cell, d, d_logits, scratch, memory, at, grad):
     d_last, d_h, d_before = np.uint64(AT + D_LAST), np.uint64(AT + D_HIDDEN), np.uint64(AT + D_BEFORE)
     for r in range(np.uint64(OUTPUTS)):
         scratch[d_last + r] = 0
+    d_shadow = 0.0
+    if DIMMED > 0:
+        d_logits, d_shadow = dimmed_backward(base, x, d_logits, memory)
     for c in range(3):
         scratch[d_last + np.uint64(c)] = d_logits[c]
     h = base + np.uint64(FIRST + (LAYERS - 1) * HIDDEN)
@@ -224,7 +255,20 @@ def backward(field, cell, d, d_logits, scratch, memory, at, grad):
         for c in range(3):
             scratch[np.uint64(AT + D_X + c)] += d_logits[c]
     basis_backward(field, base, scratch, memory, grad)
+    if DIMMED > 0:
+        scratch[np.uint64(AT + D_ROWS + DIMMED)] += d_shadow
     features_backward(field, cell, scratch, AT + D_ROWS, scratch, grad)
+
+
+def dimmed_backward(base, x, d_logits, memory):
+    """The gradients of the logits before they are dimmed, and of the feature that dims them."""
+    r, g, b = plain_logits_at(memory, x, base + np.uint64(LAST))
+    shadow = memory[base + np.uint64(DIMMED)]
+    _, red, by_red = dimmed_logit(r, shadow)
+    _, green, by_green = dimmed_logit(g, shadow)
+    _, blue, by_blue = dimmed_logit(b, shadow)
+    sent = d_logits[0] * red, d_logits[1] * green, d_logits[2] * blue
+    return sent, d_logits[0] * by_red + d_logits[1] * by_green + d_logits[2] * by_blue
 
 
 def basis_backward(field, base, scratch, memory, grad):

@@ -88,6 +88,7 @@ COLOURS = {
         mlp,
         {"width": width, "rows": 0, "hidden": 8, "layers": 3, "frequencies": 3, "diffuse": True},
     ),
+    "dimmed_mlp": lambda width: (mlp, {"width": width, "rows": 5, "hidden": 8, "dimmed": 6, "diffuse": True}),
     "mlp_of_harmonics": lambda width: (
         mlp,
         {"width": width, "rows": 0, "hidden": 8, "frequencies": 0, "direction": "harmonics"},
@@ -147,7 +148,7 @@ PRODUCTS += [
     Recipe("frame_frequencies", "of 8", "deep_trunk", "deep_mlp"),
     Recipe("always_hashed", "grid", "exp_trunk", "mlp_of_points"),
     Recipe("line", "grid", "limited", "mlp_of_harmonics"),
-    Recipe("still_too", "of 8", "exp_trunk", "rgb"),
+    Recipe("still_too", "of 8", "exp_trunk", "dimmed_mlp"),
     Recipe("warped_frequencies", "of 8", "deep_trunk", "sh_mlp"),
     Recipe("planes_lines", "planes", "density_sum", "deep_basis"),
     Recipe("plane_line", "frequencies", "density_sum", "sh_mlp"),
