@@ -73,14 +73,13 @@ def grid_of(entries: Entries, middle: np.ndarray, radius: np.ndarray) -> Importe
     around = box + np.concatenate([-voxel, voxel]) / 2
     occupancy = OccupancyGrid(box, cells_around(voxels, density[rows, 0] > 0, counts))
     tables = tables_of(resolution, *with_borders(voxels, rows, counts))
-    held = {"rows": len(density), "blocks": len(tables["vertices"])}
     shape = PartsShape(
-        {"part": "sparse_grid", "numbers": 1, **held},
-        {"part": "sparse_grid", "numbers": 3 * coefficients, **held},
+        {"part": "sparse_grid", "rows": len(density), "blocks": len(tables["vertices"])},
+        {"part": "sparse_rows", "numbers": 3 * coefficients},
         {"part": "density_sum", "activation": "relu"}, {"part": "sh", "coefficients": coefficients}, "relu",
     )  # fmt: skip
-    values = {f"density_{name}": table for name, table in tables.items()} | {"density_rows": density}
-    values |= {f"colour_{name}": table for name, table in tables.items()} | {"colour_rows": sh}
+    values = {f"density_{name}": table for name, table in tables.items()}
+    values |= {"density_rows": density, "colour_rows": sh}
     return ImportedNode(parts_field(shape, around, resolution, values, occupancy=occupancy))
 
 

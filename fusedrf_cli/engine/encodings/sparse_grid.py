@@ -1,9 +1,11 @@
-"""A grid of vertices, corners on the faces of the box, of which only some are held: rows of features, trilinear
-between them, 0 at all others (Plenoxels, Fridovich-Keil et al., CVPR 2022, sec. 3.1). Two tables of whole
-numbers find the row of a vertex, and several vertices may have the same:
+"""A grid of vertices, corners on the faces of the box, of which only some are held: a number at each of these,
+trilinear between them, 0 at all others (Plenoxels, Fridovich-Keil et al., CVPR 2022, sec. 3.1). Two tables of
+whole numbers find the row of a vertex, and several vertices may have the same:
 
     blocks      (X, Y, Z) of each block of SIDE x SIDE x SIDE vertices its place in the other table, or -1
     vertices    (N, SIDE³) of each vertex of such a block its row, or -1
+
+The colour's features at the same vertices are those of sparse_rows.py.
 """
 
 from typing import Annotated, NamedTuple
@@ -14,8 +16,8 @@ import torch
 from msgspec import Meta
 
 from fusedrf_cli.engine.fields.box import ParameterBlock, check_whole, largest
-from fusedrf_cli.engine.fields.part_options import Numbers, Rows
-from fusedrf_cli.engine.kernels.primitives import accumulate, add_scaled, scatter
+from fusedrf_cli.engine.fields.part_options import Rows
+from fusedrf_cli.engine.kernels.primitives import accumulate
 from fusedrf_cli.engine.kernels.reference import OCTANTS, whole
 
 BITS = 2
@@ -25,7 +27,6 @@ SIDE = 1 << BITS
 class Options(msgspec.Struct, forbid_unknown_fields=True):
     """See encodings."""
 
-    numbers: Numbers
     rows: Rows
     blocks: Annotated[int, Meta(ge=1, le=1 << 22)]
 
@@ -39,20 +40,17 @@ class Arrays(NamedTuple):
     counts: object  # (3,) int64, vertices per axis, corners on the faces of the box
 
 
-def sizes(numbers: int, rows: int, blocks: int) -> dict[str, int]:
+def sizes(rows: int, blocks: int) -> dict[str, int]:
     """See encodings."""
-    return {"WIDTH": numbers if numbers == 1 else -(-numbers // 8) * 8}
+    return {"WIDTH": 1}
 
 
-def sections(
-    resolution: tuple[int, int, int], numbers: int, rows: int, blocks: int
-) -> list[ParameterBlock]:
+def sections(resolution: tuple[int, int, int], rows: int, blocks: int) -> list[ParameterBlock]:
     """See encodings."""
-    width = sizes(numbers, rows, blocks)["WIDTH"]
     return [
         ParameterBlock("blocks", tuple(-(-n // SIDE) for n in resolution), rate=0, whole=True),
         ParameterBlock("vertices", (blocks, SIDE**3), rate=0, whole=True),
-        ParameterBlock("rows", (rows, width), columns=numbers),
+        ParameterBlock("rows", (rows, 1)),
     ]
 
 
@@ -75,27 +73,32 @@ def arrays(field, starts: np.ndarray, **options) -> Arrays:
     return Arrays(*starts[:3], field.corners[0])
 
 
-def reference(
-    field, sections: dict, unit: torch.Tensor, read: None, numbers: int, rows: int, blocks: int
-) -> torch.Tensor:
+def reference(field, sections: dict, unit: torch.Tensor, read: None, rows: int, blocks: int) -> torch.Tensor:
     """See encodings."""
-    counts, device = whole(field.resolution, unit.device), unit.device
-    at = unit.clamp(0, 1) * (counts - 1)
-    below = at.detach().long().minimum(counts - 2)
-    share, total = at - below, unit.new_zeros(len(unit), sections["rows"].shape[1])
+    return blend(sections, sections["rows"], field.resolution, unit)
+
+
+def blend(
+    tables: dict, rows: torch.Tensor, resolution: tuple[int, int, int], unit: torch.Tensor
+) -> torch.Tensor:
+    """(N, R) rows (M, R) of the vertices of a grid that two tables find, interpolated at unit (N, 3)."""
+    device = unit.device
+    blocks, vertices = (tables[name].to(device).round().long() for name in ("blocks", "vertices"))
+    last = whole(resolution, device) - 1
+    at = unit.clamp(0, 1) * last
+    below = at.detach().long().minimum(last - 1)
+    share, total = at - below, rows.new_zeros(len(unit), rows.shape[1])
     for offset in whole(OCTANTS, device):
         weight = torch.where(offset == 1, share, 1 - share).prod(1)
-        vertex = below + offset
-        block = sections["blocks"][(vertex // SIDE).unbind(1)].long()
-        inner = vertex % SIDE
-        place = (inner[:, 0] * SIDE + inner[:, 1]) * SIDE + inner[:, 2]
-        row = sections["vertices"][block.clamp_min(0), place].long()
-        held = ((block >= 0) & (row >= 0)).to(total.dtype)
-        total = total + (held * weight)[:, None] * sections["rows"][row.clamp_min(0)]
+        i, j, k = ((below + offset) % SIDE).unbind(1)
+        block = blocks[((below + offset) // SIDE).unbind(1)]
+        row = vertices[block.clamp_min(0), (i * SIDE + j) * SIDE + k]
+        held = (block >= 0) & (row >= 0)
+        total = total + (held * weight)[:, None].to(rows.dtype) * rows[row.clamp_min(0)]
     return total
 
 
-def bound(sections: dict, read: None, numbers: int, rows: int, blocks: int) -> torch.Tensor:
+def bound(sections: dict, read: None, rows: int, blocks: int) -> torch.Tensor:
     """See encodings. Raises ValueError where a table leads to what there is not."""
     check_whole(sections["blocks"], "blocks", blocks)
     check_whole(sections["vertices"], "vertices", rows)
@@ -144,7 +147,7 @@ def weight_of(shares, q):
 
 
 def summed(field, voxel, scratch):
-    """See encodings; of a grid of one number."""
+    """See encodings."""
     total = 0.0
     for q in range(8):
         row = voxel[0][q]
@@ -160,24 +163,3 @@ def summed_backward(field, voxel, d, base, scratch, grad):
         if row >= 0:
             sent = field.params.dtype.type(weight_of(voxel[1], q) * d[base])
             accumulate(grad, np.uint64(field.start + row), sent)
-
-
-def forward(field, voxel, scratch, out, base):
-    """See encodings; of a grid of several."""
-    start = np.uint64(base)
-    for r in range(np.uint64(WIDTH)):
-        out[start + r] = 0
-    for q in range(8):
-        row = voxel[0][q]
-        if row >= 0:
-            weight = field.params.dtype.type(weight_of(voxel[1], q))
-            add_scaled(WIDTH, out, start, weight, field.params, np.uint64(field.start + row * WIDTH))
-
-
-def backward(field, voxel, d, base, scratch, grad):
-    """See encodings."""
-    for q in range(8):
-        row = voxel[0][q]
-        if row >= 0:
-            weight = field.params.dtype.type(weight_of(voxel[1], q))
-            scatter(WIDTH, grad, np.uint64(field.start + row * WIDTH), weight, d, np.uint64(base))

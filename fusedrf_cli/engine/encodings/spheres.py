@@ -82,7 +82,7 @@ def reference(
     for offset in whole(OCTANTS, unit.device):
         weight = torch.where(offset == 1, share, 1 - share).prod(1)
         i, j, k = (lower + offset).unbind(1)
-        column = sections["columns"][i % wide, j % high].long()
+        column = sections["columns"][i % wide, j % high].round().long()
         rows = sections["rows"][column.clamp_min(0) * layers + k.clamp_max(layers - 1)]
         total = total + (weight * (column >= 0))[:, None].to(rows.dtype) * rows
     return total
@@ -97,8 +97,8 @@ def bound(sections: dict, read: None, columns: int, **options) -> torch.Tensor:
 # -- compiled ------------------------------------------------------------------------------------------------
 
 
-def locate(field, unit):
-    """See encodings: the lowest of the eight rows around a point, and the shares of the upper ones."""
+def place_at(field, unit):
+    """The lowest of the eight rows around a point, on each axis, and the shares of the upper ones."""
     x = field.lo[0] + unit[0] * field.side[0]
     y = field.lo[1] + unit[1] * field.side[1]
     z = field.lo[2] + unit[2] * field.side[2]
@@ -120,9 +120,9 @@ def corner(field, place, q):
     return row, field.params.dtype.type(weight)
 
 
-def summed(field, place, scratch):
+def summed(field, unit, scratch):
     """See encodings; of one number."""
-    total = 0.0
+    total, place = 0.0, place_at(field, unit)
     for q in range(8):
         row, weight = corner(field, place, q)
         if row >= 0:
@@ -130,13 +130,14 @@ def summed(field, place, scratch):
     return total
 
 
-def summed_backward(field, place, d, base, scratch, grad):
+def summed_backward(field, unit, d, base, scratch, grad):
     """See encodings."""
-    backward(field, place, d, base, scratch, grad)
+    backward(field, unit, d, base, scratch, grad)
 
 
-def forward(field, place, scratch, out, base):
+def forward(field, unit, scratch, out, base):
     """See encodings."""
+    place = place_at(field, unit)
     for r in range(WIDTH):
         out[base + r] = 0
     for q in range(8):
@@ -146,8 +147,9 @@ def forward(field, place, scratch, out, base):
                 out[base + r] += weight * field.params[np.uint64(row + r)]
 
 
-def backward(field, place, d, base, scratch, grad):
+def backward(field, unit, d, base, scratch, grad):
     """See encodings."""
+    place = place_at(field, unit)
     for q in range(8):
         row, weight = corner(field, place, q)
         if row >= 0:

@@ -346,7 +346,8 @@ def check_whole(values: torch.Tensor, name: str, count: int) -> None:
     """Raise ValueError unless values of that name are whole numbers from -1 to below `count`."""
     low, high = float(values.amin()), float(values.amax())
     if not (low >= -1 and high < count and torch.equal(values, values.round())):
-        raise ValueError(f"'{name}' should be whole numbers from -1 to {count - 1}, found {low:g} to {high:g}")
+        found = f"found {low:g} to {high:g}"
+        raise ValueError(f"'{name}' should be whole numbers from -1 to {count - 1}, {found}")
 
 
 def lines_of(rows: np.ndarray, width: int) -> np.ndarray:
