@@ -5,7 +5,14 @@ import itertools
 import numpy as np
 
 from formats.errors import FormatError, LimitExceeded
-from fusedrf_cli.bridge.importing.parts import Entries, Imported, ImportedNode, parts_field
+from fusedrf_cli.bridge.importing.parts import (
+    Entries,
+    Imported,
+    ImportedNode,
+    check_layers,
+    packed,
+    parts_field,
+)
 from fusedrf_cli.engine.encodings.sparse_grid import tables_of
 from fusedrf_cli.engine.fields.box import MAX_TEXELS
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
@@ -16,6 +23,10 @@ MAX_VOXELS = 1 << 30
 MAX_ROWS = 1 << 24
 MOST_CELLS = 256
 """Along an axis."""
+SH, TEXTURE, NETWORK = 1, 4, 255
+"""Of `basis_type`."""
+MLP = "pt__basis_mlp__"
+"""In front of the names of its layers."""
 SPHERES = space_of(contracted_l2, contracted_density=contracted_l2.OUTWARD)
 
 
@@ -64,9 +75,9 @@ def grid_of(entries: Entries, middle: np.ndarray, radius: np.ndarray) -> Importe
     voxels, resolution = np.nonzero(links >= 0), tuple(n + 2 for n in links.shape)
     rows, counts = links[voxels], np.array(links.shape)
     del links
-    density, sh = numbers_of(entries)
+    density, colour = numbers_of(entries)
     check_rows(rows, len(density), "rows of numbers")
-    coefficients = sh.shape[1] // 3
+    rgb, basis = basis_of(entries, colour.shape[1])
     box, voxel = np.concatenate([middle - radius, middle + radius]), 2 * radius / counts
     # Numbers stand for middles of voxels, and stay the same in the outer half of the last ones: with a vertex
     # more on each side all lie on faces of a box.
@@ -75,28 +86,59 @@ def grid_of(entries: Entries, middle: np.ndarray, radius: np.ndarray) -> Importe
     tables = tables_of(resolution, *with_borders(voxels, rows, counts))
     shape = PartsShape(
         {"part": "sparse_grid", "rows": len(density), "blocks": len(tables["vertices"])},
-        {"part": "sparse_rows", "numbers": 3 * coefficients},
-        {"part": "density_sum", "activation": "relu"}, {"part": "sh", "coefficients": coefficients}, "relu",
+        {"part": "sparse_rows", "numbers": colour.shape[1]},
+        {"part": "density_sum", "activation": "relu"}, rgb, "relu",
     )  # fmt: skip
     values = {f"density_{name}": table for name, table in tables.items()}
-    values |= {"density_rows": density, "colour_rows": sh}
+    values |= {"density_rows": density, "colour_rows": colour, **basis}
     return ImportedNode(parts_field(shape, around, resolution, values, occupancy=occupancy))
 
 
 def numbers_of(entries: Entries) -> tuple[np.ndarray, np.ndarray]:
-    """Density (M, 1) and coefficients (M, 3 K) of the rows."""
+    """Density (M, 1) and the colours' numbers (M, 3 K), channel by channel, of the rows."""
     if "data" in entries.values:  # of the first version
         data = entries.array("data", None, None)
-        density, sh = data[:, :1], data[:, 1:]
-    else:
-        density = entries.array("density_data", None, 1)
-        sh = entries.array("sh_data", len(density), None)
-    basis = entries.whole("basis_type", 0, 255, 1)
-    if basis != 1:
-        raise FormatError(f"'basis_type' should be 1, spherical harmonics, found {basis}")
-    if sh.shape[1] not in (3, 12, 27, 48):
-        raise FormatError(f"'sh_data' should have 3, 12, 27 or 48 numbers a row, found {sh.shape[1]}")
-    return density, sh
+        return data[:, :1], data[:, 1:]
+    density = entries.array("density_data", None, 1)
+    return density, entries.array("sh_data", len(density), None)
+
+
+def basis_of(entries: Entries, columns: int) -> tuple[dict, dict[str, np.ndarray]]:
+    """What makes colours of so many numbers a row: the entry of a shape, and sections."""
+    kind = entries.whole("basis_type", 0, 255, SH)
+    if kind == SH:
+        if columns not in (3, 12, 27, 48):
+            raise FormatError(f"'sh_data' should have 3, 12, 27 or 48 numbers a row, found {columns}")
+        return {"part": "sh", "coefficients": columns // 3}, {}
+    if columns < 3 or columns % 3:
+        raise FormatError(f"'sh_data' should have as many numbers for each channel, found {columns}")
+    if kind == TEXTURE:
+        texture = entries.array("basis_data", None, None, None, columns // 3)
+        side = len(texture)
+        if texture.shape[:3] != (side,) * 3 or side < 2:
+            raise FormatError(f"'basis_data' should be a cube, found {list(texture.shape)}")
+        return {"part": "direction_texture", "own": columns // 3, "side": side}, {"rgb_texture": texture}
+    if kind != NETWORK:
+        raise FormatError(f"'basis_type' should be {SH}, {TEXTURE} or {NETWORK}, found {kind}")
+    return network_of(entries, columns // 3)
+
+
+def network_of(entries: Entries, count: int) -> tuple[dict, dict[str, np.ndarray]]:
+    """The same, of a network that makes a basis of so many numbers."""
+    named = {
+        name[len(MLP) :].replace("__", "."): v for name, v in entries.values.items() if name.startswith(MLP)
+    }
+    layers = Entries(named, f"{MLP}: ").layers("")
+    frequencies = max(layers[0][0].shape[1] - 3, 0) // 6
+    hidden = check_layers(layers, 3 + 6 * frequencies, count)
+    sections = {
+        f"rgb_layer_{i}": packed(weight, bias, hidden if i else 3 + 6 * frequencies)
+        for i, (weight, bias) in enumerate(layers)
+    }
+    return {
+        "part": "direction_basis", "hidden": hidden, "layers": len(layers) - 1, "own": count,
+        "frequencies": frequencies, "squashed": True,
+    }, sections  # fmt: skip
 
 
 def with_borders(

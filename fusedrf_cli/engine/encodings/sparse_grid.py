@@ -1,6 +1,6 @@
-"""A grid of vertices, corners on the faces of the box, of which only some are held: a number at each of these,
-trilinear between them, 0 at all others (Plenoxels, Fridovich-Keil et al., CVPR 2022, sec. 3.1). Two tables of
-whole numbers find the row of a vertex, and several vertices may have the same:
+"""A grid of vertices, corners on the faces of the box, of which only some are held: a number at each of
+these, trilinear between them, 0 at all others (Plenoxels, Fridovich-Keil et al., CVPR 2022, sec. 3.1). Two
+tables of whole numbers find the row of a vertex, and several vertices may have the same:
 
     blocks      (X, Y, Z) of each block of SIDE x SIDE x SIDE vertices its place in the other table, or -1
     vertices    (N, SIDE³) of each vertex of such a block its row, or -1
