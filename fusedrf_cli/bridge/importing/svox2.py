@@ -1,6 +1,7 @@
 """Plenoxels' files (Fridovich-Keil et al., CVPR 2022; github.com/sxyu/svox2): a SparseGrid's .npz."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,7 +28,6 @@ SH, TEXTURE, NETWORK = 1, 4, 255
 """Of `basis_type`."""
 MLP = "pt__basis_mlp__"
 """In front of the names of its layers."""
-SPHERES = space_of(contracted_l2, contracted_density=contracted_l2.OUTWARD)
 
 
 def read(checkpoint) -> Imported:
@@ -39,12 +39,10 @@ def read(checkpoint) -> Imported:
     )
     if not (radius > 0).all():
         raise FormatError("'radius' should be above 0")
-    nodes, notes = [grid_of(entries, middle, radius)], []
+    nodes = [grid_of(entries, middle, radius)]
     if "background_links" in entries.values:
-        nodes.append(background_of(entries, middle, radius))
-        if radius.max() > radius.min():
-            notes.append("the background's density is a mean, since the radius is not the same on all axes")
-    return Imported(nodes, notes, rule="add")
+        nodes = [replace(nodes[0], suffix=" grid"), background_of(entries, middle, radius)]
+    return Imported(nodes, rule="add")
 
 
 def links_of(entries: Entries, name: str, dimensions: int, most: int) -> np.ndarray:
@@ -176,8 +174,8 @@ def cells_around(voxels: tuple[np.ndarray, ...], dense: np.ndarray, counts: np.n
 
 
 def background_of(entries: Entries, middle: np.ndarray, radius: np.ndarray) -> ImportedNode:
-    """The spheres around the unit ball of the box. Their σ is per world length where 1/rho, rho counted in
-    radii, falls by 1 in a world unit."""
+    """The spheres around the unit ball of the box. Their σ is per growth of -1/rho, rho counted in radii,
+    times the world's length of a radius in the ray's direction."""
     links = links_of(entries, "background_links", 2, MAX_ROWS)
     data = entries.array("background_data", None, None, 4)
     check_rows(links, len(data), "columns of 'background_data'")
@@ -194,12 +192,15 @@ def background_of(entries: Entries, middle: np.ndarray, radius: np.ndarray) -> I
         "density_columns": columns, "density_rows": rows[:, 3:],
         "colour_columns": columns, "colour_rows": rows[:, :3],
     }  # fmt: skip
-    cells = OccupancyGrid.full(contracted_l2.WHOLE, 64, SPHERES)
+    scale = np.prod(radius) ** (1 / 3)
+    units = {f"unit_{axis}": float(r / scale) for axis, r in zip("xyz", radius, strict=True)}
+    space = space_of(contracted_l2, contracted_density=contracted_l2.OUTWARD,
+                     **(units if radius.max() > radius.min() else {}))  # fmt: skip
+    cells = OccupancyGrid.full(contracted_l2.WHOLE, 64, space)
     far = np.linalg.norm(cells.centres(), axis=1).reshape(cells.occupied.shape)
     half = np.sqrt(3) * cells.cell[0] / 2
     occupied = cells.marked((far > 1 - half) & (far < 2 + half))
     resolution = (min(8 * max(layers, 32) + 1, MAX_TEXELS),) * 3  # so that samples lie half a layer apart
-    scale = np.prod(radius) ** (1 / 3)
     field = parts_field(shape, contracted_l2.WHOLE, resolution, values, scale, occupancy=occupied)
     placement = np.diag([*radius, 1.0])
     placement[:3, 3] = middle

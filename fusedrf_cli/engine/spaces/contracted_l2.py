@@ -8,7 +8,7 @@ for a unit of τ, and the integral of that bound is t_local: from τ0 on, with q
     τ(t_local) = (τ0 + b² q) / (1 - τ0 q).
 
 With the density OUTWARD all of the space but the ball is a stack of spheres, as behind a scene of Plenoxels:
-σ is per unit of 1/|x| (by SHELL), on a ray's way out alone.
+σ is per unit of 1/|x| (by SHELL), on a ray's way out alone, times the length of a unit of the frame that way.
 """
 
 import math
@@ -48,7 +48,9 @@ from fusedrf_cli.engine.spaces.unbounded import (  # noqa: F401
 
 PIECES = 3  # up to the ball, or to where the ray is nearest to the origin; in the ball; behind it
 OUTWARD = 2.0  # of CONTRACTED_DENSITY: σ is per growth of |coordinates| along a ray, where they grow (svox2)
+UNIT_X = UNIT_Y = UNIT_Z = 1.0  # of the frame's axes, by the length that σ is per where it is OUTWARD
 CONSTANTS = curved.CONSTANTS | {"contracted_density": (0.0, OUTWARD)}
+CONSTANTS |= {f"unit_{axis}": (0.01, 100.0) for axis in "xyz"}
 INWARDS, INSIDE, OUTWARDS, BEYOND = 0, 1, 2, 3  # regions of a ray, in order
 
 
@@ -66,7 +68,8 @@ def rate(q, d):
         return 1.0
     n, out = size_before(m), (q[0] * d[0] + q[1] * d[1] + q[2] * d[2]) / m
     if CONTRACTED_DENSITY == OUTWARD:
-        return SHELL * max(out, 0.0) / (n * n)
+        length = size_of((UNIT_X * d[0], UNIT_Y * d[1], UNIT_Z * d[2]))
+        return SHELL * max(out, 0.0) / (n * n) * length
     across = scale_of(n) * n * n
     return math.sqrt(SHELL * SHELL * out * out + max(1.0 - out * out, 0.0) * across * across) / (n * n)
 
@@ -186,5 +189,6 @@ def density_rates(points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
     n = x.norm(dim=1, keepdim=True)
     growth = (x * dirs).sum(1, keepdim=True) / n.clamp_min(1)
     if CONTRACTED_DENSITY == OUTWARD:
-        return torch.where(n > 1, SHELL * growth.clamp_min(0) / n.clamp_min(1) ** 2, 0).squeeze(1)
+        length = (dirs * torch.tensor([UNIT_X, UNIT_Y, UNIT_Z]).to(dirs)).norm(dim=1)
+        return length * torch.where(n > 1, SHELL * growth.clamp_min(0) / n.clamp_min(1) ** 2, 0).squeeze(1)
     return density_rates_by(x, dirs, n, growth, SHELL)
