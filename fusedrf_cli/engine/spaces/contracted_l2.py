@@ -189,6 +189,7 @@ def density_rates(points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
     n = x.norm(dim=1, keepdim=True)
     growth = (x * dirs).sum(1, keepdim=True) / n.clamp_min(1)
     if CONTRACTED_DENSITY == OUTWARD:
-        length = (dirs * torch.tensor([UNIT_X, UNIT_Y, UNIT_Z]).to(dirs)).norm(dim=1)
+        u, v, w = dirs.unbind(1)
+        length = torch.stack([UNIT_X * u, UNIT_Y * v, UNIT_Z * w]).norm(dim=0)
         return length * torch.where(n > 1, SHELL * growth.clamp_min(0) / n.clamp_min(1) ** 2, 0).squeeze(1)
     return density_rates_by(x, dirs, n, growth, SHELL)
