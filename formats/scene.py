@@ -7,6 +7,7 @@ product from the root down. Placement words are glTF's: `translation`, `rotation
 
 import dataclasses
 import json
+import math
 import re
 import unicodedata
 import warnings
@@ -45,7 +46,8 @@ from formats.nodes import make_node as make_node
 from formats.safe_input import parse_json, read_input
 
 FORMAT = "rfpack"
-VERSION = "1.4"
+VERSION = "1.5"
+RULED_VERSION = "1.4"  # of scenes that require RULES
 FAR_VERSION = "1.3"  # of scenes that require FAR
 SHOWING_VERSION = "1.2"  # of scenes that show a node otherwise than it is
 FRAMED_VERSION = "1.1"  # of scenes with cameras or a framing
@@ -104,6 +106,7 @@ class SceneSchema(msgspec.Struct, omit_defaults=True):
     requires: Annotated[list[Literal["far", "rules"]], msgspec.Meta(max_length=2)] = []
     framing: Box | msgspec.UnsetType = msgspec.UNSET
     cameras: RigSchema | msgspec.UnsetType = msgspec.UNSET
+    up: Vector3 | msgspec.UnsetType = msgspec.UNSET
 
 
 NODE_KEYS = NodeSchema.__struct_fields__
@@ -126,6 +129,8 @@ class SceneGraph:
     cameras: dict | None = None
     """Of the capture that a field was learnt from, in the world, as `formats.camera_set.read_camera_set`
     takes them."""
+    up: tuple[float, ...] | None = None
+    """(3,) which way of the world is up in pictures, a unit vector; None: +z, or as cameras were held."""
 
     def __post_init__(self):
         if self.composition not in ("max", "add"):
@@ -216,7 +221,7 @@ def parse_scene(data: bytes, where: str) -> SceneGraph:
         roots = tuple(_build_node(node) for node in nodes)
         if "cameras" in content:
             read_camera_set(content["cameras"])
-        shown = _framing(content), content.get("cameras")
+        shown = _framing(content), content.get("cameras"), _up(content)
         history = tuple(spec.history)
         return SceneGraph(roots, spec.composition, history, spec.generator, spec.version, extras, *shown)
     except msgspec.ValidationError as error:
@@ -234,12 +239,15 @@ def dump_scene(scene: SceneGraph) -> bytes:
     shown = {"framing": scene.framing and list(scene.framing), "cameras": scene.cameras}
     shown = {key: value for key, value in shown.items() if value is not None}
     least = FRAMED_VERSION if shown else PLAIN_VERSION
+    upright = {} if scene.up is None else {"up": list(scene.up)}
     if any(node.showing for node, _, _ in scene.walk()):
         least = SHOWING_VERSION
     requires = [FAR] if scene.far else []
     requires += [RULES] if any(node.composition for node, _, _ in scene.walk()) else []
     if requires:
-        least = VERSION if RULES in requires else FAR_VERSION
+        least = RULED_VERSION if RULES in requires else FAR_VERSION
+    if upright:
+        least = VERSION
     content = {
         "format": FORMAT,
         "version": max(scene.version, least, key=_numbered),
@@ -249,6 +257,7 @@ def dump_scene(scene: SceneGraph) -> bytes:
         "nodes": [_node_content(node) for node in scene.nodes],
         "history": list(scene.history),
         **shown,
+        **upright,
         **{key: scene.extras[key] for key in sorted(scene.extras)},
     }
     try:
@@ -318,6 +327,16 @@ def _framing(content: dict) -> tuple[float, ...] | None:
     ):
         raise BadSchema(f"framing {box} is no box, expected each minimum below its maximum")
     return tuple(float(number) for number in box)
+
+
+def _up(content: dict) -> tuple[float, ...] | None:
+    """Which way is up, checked."""
+    up = content.get("up")
+    if up is None:
+        return None
+    if not 0.99 <= math.hypot(*up) <= 1.01:
+        raise BadSchema(f"up {up} should have a length of 1")
+    return tuple(float(number) for number in up)
 
 
 def _check_extent(nodes: object, where: str) -> None:

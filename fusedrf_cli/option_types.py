@@ -305,7 +305,7 @@ class KindType(click.ParamType):
         """All that may be given."""
         from fusedrf_cli.engine.kinds import registry
 
-        return [*self.others, *registry.names()]
+        return [*self.others, *(name for name in registry.names() if name not in registry.IMPORTED)]
 
     def get_metavar(self, param, ctx=None):
         return f"[{'|'.join(self.names())}]"
@@ -325,7 +325,8 @@ class FieldKindType(KindType):
     def names(self) -> list[str]:
         from fusedrf_cli.engine.kinds import registry
 
-        return [name for name in registry.names() if name not in registry.WAYS]
+        left_out = {*registry.WAYS, *registry.IMPORTED}
+        return [name for name in registry.names() if name not in left_out]
 
 
 class KindsType(KindType):

@@ -150,6 +150,8 @@ class ImportRequest(Writing):
     """The capture that the field was learnt from, whose cameras the bundle keeps."""
     time: float | None = None
     """That a moving scene is taken at."""
+    up: Vector | None = None
+    """Which way of its world is up, of any length but 0; None: as the habit of its format has it."""
     memory: Count | None = None
 
 

@@ -129,7 +129,7 @@ def _check_all(check: Callable, outputs: dict[str, bool], overwrite: bool) -> No
 
 pose = verb("pose", requests.PoseRequest)
 train = verb("train", requests.TrainRequest)
-import_field = verb("import_field", requests.ImportRequest, module="bridge.importing")
+import_field = verb("import_field", requests.ImportRequest)
 compose = verb("compose", requests.ComposeRequest, module="files")
 fuse = verb("fuse", requests.FuseRequest)
 convert = verb("convert", requests.ConvertRequest)

@@ -11,6 +11,7 @@ from fusedrf_cli.bridge.deleting import delete
 from fusedrf_cli.bridge.evaluating import evaluate
 from fusedrf_cli.bridge.extracting import extract
 from fusedrf_cli.bridge.fusing import fuse
+from fusedrf_cli.bridge.importing import import_field
 from fusedrf_cli.bridge.kind_list import list_kinds
 from fusedrf_cli.bridge.posing import pose
 from fusedrf_cli.bridge.rendering import render
@@ -27,6 +28,7 @@ __all__ = [
     "evaluate",
     "extract",
     "fuse",
+    "import_field",
     "list_kinds",
     "move",
     "pose",

@@ -16,6 +16,7 @@ def list_kinds(request: KindsRequest, progress) -> dict:
             continue
         does = ["train"] if kind.trains else []
         does += ["fuse"] if kind.field is None else ["fuse", "convert"]
+        does = ["import"] if name in registry.IMPORTED else does
         rows.append(
             {"name": name, "good_for": kind.good_for, "does": does, "package": registry.package_of(name)}
         )

@@ -65,6 +65,8 @@ def upward(request: RenderRequest, scene: LoadedScene) -> np.ndarray:
     if request.up is not None:
         up = np.array(request.up) / np.abs(request.up).max()
         return up / np.linalg.norm(up)
+    if scene.graph.up is not None:
+        return np.array(scene.graph.up) / np.linalg.norm(scene.graph.up)
     camera_set = camera_set_of(scene)
     if camera_set is None or camera_set.surroundings:
         return UP if camera_set is None else camera_set.up

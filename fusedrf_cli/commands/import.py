@@ -3,7 +3,7 @@
 import click
 
 from fusedrf_cli import options, verbs
-from fusedrf_cli.option_types import BoxType, InputType, PositiveType
+from fusedrf_cli.option_types import BoxType, InputType, PositiveType, VectorType
 
 
 @click.command("import")
@@ -18,19 +18,21 @@ from fusedrf_cli.option_types import BoxType, InputType, PositiveType
 @click.option(
     "--cameras", type=InputType(), metavar="CAPTURE", help="The capture it was learnt from: keep its cameras."
 )
+@click.option("--up", type=VectorType(), help="Which way of its world is up; default: as its format has it.")
 @click.option("--time", type=float, help="Take a moving scene at this time.")
 @options.imported_precision
 @options.memory
 @options.reporting
 def command(**words):
-    """Turn another system's file into a bundle that answers exactly as it does.
+    """Turn another system's file into a bundle of its numbers.
 
     FILE is a checkpoint of TensoRF, Plenoxels (svox2), DVGO, Instant-NGP, NeRF (nerf-pytorch),
-    torch-ngp, PVD or nerfacto, told apart by what it holds, or the folder of a run, whose newest
-    checkpoint is taken. Nothing in it is run, and nothing is learnt.
+    torch-ngp, PVD or nerfacto, or the folder of a run, whose newest checkpoint is taken; or Gaussian
+    splats: .ply, .spz, .sog, .splat, .ksplat or glTF. Files are told apart by what they hold.
+    Nothing in them is run, and nothing is learnt.
 
     \b
     Example:
-      fusedrf import logs/lego/lego.th -o lego.rfpack
+      fusedrf import lego.th -o lego.rfpack
     """
     return verbs.import_field(**words)

@@ -248,7 +248,7 @@ def test_render_hands_on_a_background(run, bridge, colour, background):
     assert (name, asked["scene"], asked["output"]) == ("render", "chair.rfpack", "out.png")
     assert asked["background"] == background
     others = {"cameras", "path", "views", "orbit", "look_at", "view_from", "zoom", "up", "size", "depth"}
-    others |= {"near", "far", "reference"}
+    others |= {"near", "far", "step", "reference"}
     wanted = {*COMMON, "scene", "output", "background", "allow_outside", "fps", *others}
     assert set(asked) == wanted - {"seed"}
 

@@ -21,6 +21,7 @@ EDITED = dict(files=("out.rfpack",))
 COMMANDS = {
     "pose": Writes(("pose", "photos", "-o", "out"), folders=("out",)),
     "train": Writes(("train", "photos", "-o", "out.rfpack"), **EDITED),
+    "import": Writes(("import", *FUSED), **EDITED),
     "compose": Writes(("compose", "chair.rfpack", "-o", "out.json"), files=("out.json",)),
     "fuse": Writes(("fuse", *FUSED), **EDITED),
     "convert": Writes(("convert", *FUSED, "--kind", "sparse"), **EDITED),

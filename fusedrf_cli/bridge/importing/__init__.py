@@ -16,8 +16,10 @@ from formats.foreign.systems import SYSTEMS, Checkpoint, open_checkpoint
 from formats.graph import free_name, placement_of
 from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node
+from formats.splats.reading import is_splats
 from formats.views import Capture
 from fusedrf_cli import __version__
+from fusedrf_cli.bridge.importing import splats
 from fusedrf_cli.bridge.importing.parts import Imported
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.engine.kinds import registry
@@ -48,31 +50,39 @@ def import_field(request: ImportRequest, progress) -> dict:
     """Write what a file of another system holds."""
     progress.phase("reading", None)
     memory = Memory(request.memory)
-    checkpoint = open_checkpoint(request.path)
-    if checkpoint.system not in READERS:
-        known = ", ".join(SYSTEMS[name].title for name in READERS)
-        raise InvalidInput(
-            f"{checkpoint.path}: a checkpoint of {SYSTEMS[checkpoint.system].title}, which is not read; "
-            f"read are those of {known}"
-        )
     capture = None if request.cameras is None else read_capture(request.cameras)
-    parts = {"the field": COPIES * bytes_of(checkpoint.entries)}
-    memory.expect(parts, advice="close other programs, or raise --memory")
-    imported = imported_from(checkpoint, request, capture)
+    if Path(request.path).is_file() and is_splats(request.path):
+        system, (imported, up) = "Gaussian splats", splats.read(request.path, memory)
+    else:
+        (system, imported), up = of_system(request, capture, memory), None
     progress.phase("writing", None)
-    graph = write(imported, request, capture)
-    notes = [*checkpoint.notes, *imported.notes]
+    graph = write(imported, request, capture, up)
     return {
         "output": request.output,
         "bytes": Path(request.output).stat().st_size,
-        "system": SYSTEMS[checkpoint.system].title,
+        "system": system,
         "fields": [
             {"name": leaf.name, "kind": field.kind, **registry.kind(field.kind).describe(field)}
             for leaf, field in zip(graph.leaves(), (n.field for n in imported.nodes), strict=True)
         ],
-        "notes": notes,
+        "notes": [*imported.notes],
         "memory": memory.report(),
     }
+
+
+def of_system(request: ImportRequest, capture: Capture | None, memory: Memory) -> tuple[str, Imported]:
+    """What a checkpoint holds, and the name of the system that wrote it."""
+    checkpoint = open_checkpoint(request.path)
+    title = SYSTEMS[checkpoint.system].title
+    if checkpoint.system not in READERS:
+        known = ", ".join(SYSTEMS[name].title for name in READERS)
+        raise InvalidInput(
+            f"{checkpoint.path}: a checkpoint of {title}, which is not read; read are those of {known}"
+        )
+    parts = {"the field": COPIES * bytes_of(checkpoint.entries)}
+    memory.expect(parts, advice="close other programs, or raise --memory")
+    imported = imported_from(checkpoint, request, capture)
+    return title, replace(imported, notes=[*checkpoint.notes, *imported.notes])
 
 
 def bytes_of(entries: object) -> float:
@@ -117,8 +127,10 @@ def box_of(request: ImportRequest, capture: Capture | None) -> np.ndarray:
     return np.concatenate([corners.min(0), corners.max(0)])
 
 
-def write(imported: Imported, request: ImportRequest, capture: Capture | None) -> SceneGraph:
-    """Write the bundle; its scene graph."""
+def write(
+    imported: Imported, request: ImportRequest, capture: Capture | None, up: tuple[float, ...] | None
+) -> SceneGraph:
+    """Write the bundle; its scene graph. up: which way is up in its world, where that is known."""
     writer, nodes, names = BundleWriter(), [], set()
     wanted = request.name or Path(request.path).stem
     for node in imported.nodes:
@@ -132,6 +144,9 @@ def write(imported: Imported, request: ImportRequest, capture: Capture | None) -
     if capture is not None:
         unbounded = any(node.field.space is not bounded for node in imported.nodes)
         cameras = capture_camera_set(capture, surroundings=unbounded).content()
-    graph = SceneGraph(tuple(nodes), generator=f"fusedrf {__version__}", cameras=cameras)
+    if request.up is not None:
+        up = np.array(request.up) / np.abs(request.up).max()
+        up = tuple((up / np.linalg.norm(up)).tolist())
+    graph = SceneGraph(tuple(nodes), generator=f"fusedrf {__version__}", cameras=cameras, up=up)
     writer.write(request.output, graph, overwrite=request.overwrite)
     return graph

@@ -18,6 +18,8 @@ AUTO = "auto"  # the name under which a kind is chosen by what the kinds say of 
 INSTANCES = "blocks"  # the name under which nothing is learnt: every source stays a field of its own
 WAYS = {INSTANCES: f"{__package__}.instances"}
 """Ways of fusing whose fields are of other kinds, and the modules that hold them."""
+IMPORTED = frozenset({"assembled", "splats"})
+"""Kinds that other systems' files become; nothing is learnt as one of them."""
 DEFAULT = "vm"  # what photos become where no kind is named
 
 

@@ -1,0 +1,31 @@
+"""The `splats` kind: 3D Gaussian splatting's Gaussians, as they are imported."""
+
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.kinds.builder import Suitability
+from fusedrf_cli.engine.kinds.kind import Kind
+from fusedrf_cli.engine.kinds.splats.field import SplatsField
+from fusedrf_cli.engine.kinds.sweeps import Sweep
+
+
+class SplatsKind(Kind):
+    """See Kind."""
+
+    name = "splats"
+    good_for = "What `fusedrf import` makes of a splat file: its own Gaussians, nothing learnt."
+    field = SplatsField
+    trains = False
+
+    def suits(self, scene: ComposedField) -> Suitability:
+        """See Kind."""
+        return Suitability(None, f"fields of kind '{self.name}' are imported, and nothing is fused to them")
+
+    def sweeps(self, least_psnr: float) -> dict[str, list[Sweep]]:
+        """See Kind."""
+        return {}
+
+    def describe(self, field: SplatsField) -> dict:
+        """See Kind."""
+        return {"splats": len(field.centres), "sh_degree": round(field.coefficients**0.5) - 1}
+
+
+KIND = SplatsKind()
