@@ -80,6 +80,7 @@ def contract(x: np.ndarray, d: np.ndarray, space: str | dict) -> tuple[np.ndarra
         shell, order = constants.get("shell", 1.0), {"contracted_l2": 2, "contracted_linf": np.inf}[name]
 
         def coordinates(x: np.ndarray) -> np.ndarray:
+            x = x * [constants.get(f"stretch_{axis}", 1.0) for axis in "xyz"]
             n = np.maximum(np.linalg.norm(x, order, 1, keepdims=True), 1)
             return np.where(n > 1, (1 + shell - shell / n) * x / n, x)
 

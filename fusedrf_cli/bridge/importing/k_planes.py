@@ -25,7 +25,7 @@ from fusedrf_cli.bridge.importing.parts import (
 )
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsShape
-from fusedrf_cli.engine.spaces import bounded, contracted_linf
+from fusedrf_cli.engine.spaces import bounded, contracted_linf, space_of
 
 FIELD = "field."
 MOST_SAMPLES = 512  # vertices along an axis by which rays are sampled
@@ -46,7 +46,7 @@ def read(checkpoint, time: float | None = None) -> Imported:
         notes.append(f"it moves, and stands as at time {time:g} of -1 to 1")
     elif time is not None:
         notes.append("its scene stands still: no time is needed")
-    box, flipped, placement, space, scale = where(state, notes)
+    box, flipped, placement, space, scale = where(state)
     features, width = grids[0][0].shape[-1], eight(grids[0][0].shape[-1])
     encoding, values = planes_of(grids, width, flipped)
     sigma_net, summed = density_net(state, features, len(grids), settings)
@@ -152,7 +152,7 @@ def planes_of(
     return {"part": "planes", "features": width, "scales": scales, "lines": lines}, values
 
 
-def where(state: Entries, notes: list[str]):
+def where(state: Entries):
     """The box (6,), which axes (3,) run the other way in it, where it lies, its space, and what densities are
     to be multiplied by."""
     name = FIELD + "spatial_distortion.global_"
@@ -164,14 +164,14 @@ def where(state: Entries, notes: list[str]):
         return box, corners[0] > corners[1], np.eye(4), bounded, 1.0
     scale = np.broadcast_to(state.array(name + "scale").astype(np.float64).reshape(-1), 3)
     moved = np.broadcast_to(state.array(name + "translation").astype(np.float64).reshape(-1), 3)
-    if not (np.abs(scale) > 1e-6).all():
-        raise FormatError(f"'{name}scale' should not be 0, found {scale.tolist()}")
-    placement = np.diag([*1 / scale, 1.0])
+    if not (scale > 0).all() or scale.max() > 100 * scale.min():
+        raise FormatError(f"'{name}scale' should be three numbers above 0, found {scale.tolist()}")
+    mean = float(np.prod(scale) ** (1 / 3))
+    placement = np.diag([1 / mean] * 3 + [1.0])
     placement[:3, 3] = -moved / scale
-    mean = float(np.abs(np.prod(scale)) ** (1 / 3))
-    if np.ptp(scale) > 1e-6 * mean:
-        notes.append("its scene was stretched unevenly: densities and directions are right on average")
-    return np.array([-2.0] * 3 + [2.0] * 3), np.zeros(3, bool), placement, contracted_linf, 1 / mean
+    stretch = () if np.ptp(scale) == 0 else zip("xyz", scale / mean, strict=True)
+    space = space_of(contracted_linf, **{f"stretch_{axis}": float(share) for axis, share in stretch})
+    return np.array([-2.0] * 3 + [2.0] * 3), np.zeros(3, bool), placement, space, 1 / mean
 
 
 # -- networks ------------------------------------------------------------------------------------------------

@@ -116,6 +116,8 @@ def seen(width: int, features: int, layer: Layer) -> tuple[ColourInput, np.ndarr
 
 def stacked(*layers: Layer) -> Layer:
     """Layers that read the same, as one."""
+    if len(reads := {weight.shape[1] for weight, _ in layers}) > 1:
+        raise FormatError(f"layers side by side should read as many numbers, found {sorted(reads)}")
     weights = np.concatenate([weight for weight, _ in layers])
     biases = [np.zeros(len(weight)) if bias is None else bias for weight, bias in layers]
     return weights, np.concatenate(biases)

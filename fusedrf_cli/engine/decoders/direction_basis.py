@@ -13,7 +13,8 @@ import torch
 from fusedrf_cli.engine.decoders.mlp import encode
 from fusedrf_cli.engine.fields.box import ParameterBlock
 from fusedrf_cli.engine.fields.part_options import Frequencies, Layers, Width
-from fusedrf_cli.engine.kernels.primitives import add_scaled, dense, dense_backward, dot, rectify, sigmoid
+from fusedrf_cli.engine.kernels.networks import network, network_backward
+from fusedrf_cli.engine.kernels.primitives import add_scaled, dot, sigmoid
 
 
 class Options(msgspec.Struct, forbid_unknown_fields=True):
@@ -54,11 +55,11 @@ def sizes(
     width: int, hidden: int, layers: int = 1, own: int = 0, frequencies: int = 0, squashed: bool = False
 ) -> dict[str, int]:
     """See decoders; scratch holds what `basis_sizes` says, the input, what the layers made of it, and the
-    gradients of two layers. Features are kept."""
+    gradients of two layers and of the input. Features are kept."""
     constants, rooms = basis_sizes(width, own)
     inputs = 3 + 6 * frequencies
-    widest = max(hidden, -(-inputs // 8) * 8)
-    rooms |= {"INPUT": -(-inputs // 8) * 8, "H": layers * hidden, "D_H": widest, "D_BEFORE": widest}
+    wide = -(-inputs // 8) * 8
+    rooms |= {"INPUT": wide, "H": layers * hidden, "D_H": hidden, "D_BEFORE": hidden, "D_INPUT": wide}
     starts = np.cumsum([0, *rooms.values()]).tolist()
     return constants | {
         "HIDDEN": hidden, "LAYERS": layers, "INPUTS": inputs, "CORE": 3, "FREQUENCIES": frequencies,
@@ -115,37 +116,28 @@ def bound(
 
 def ray_setup(field, d, scratch):
     """B of the direction into scratch[AT + BASIS:], channel by channel."""
-    x, h, params = np.uint64(AT + INPUT), np.uint64(AT + H), field.params
+    x, basis = np.uint64(AT + INPUT), np.uint64(AT + BASIS)
     scratch[x], scratch[x + np.uint64(1)], scratch[x + np.uint64(2)] = d
     encode(scratch, x)
-    dense(INPUTS, HIDDEN, params, np.uint64(field.layers[0]), scratch, x, scratch, h)
-    rectify(HIDDEN, scratch, h)
-    for layer in range(1, LAYERS):
-        below, h = h, h + np.uint64(HIDDEN)
-        dense(HIDDEN, HIDDEN, params, np.uint64(field.layers[layer]), scratch, below, scratch, h)
-        rectify(HIDDEN, scratch, h)
-    last = np.uint64(field.layers[LAYERS])
-    dense(HIDDEN, OUTPUTS, params, last, scratch, h, scratch, np.uint64(AT + BASIS))
+    h = np.uint64(AT + H)
+    network(INPUTS, HIDDEN, LAYERS, 0, OUTPUTS, field.params, field.layers, scratch, x, h, basis)
     if SQUASHED:
-        for r in range(np.uint64(AT + BASIS), np.uint64(AT + BASIS + OUTPUTS)):
-            scratch[r] = sigmoid(scratch[r])
+        for r in range(np.uint64(OUTPUTS)):
+            scratch[basis + r] = sigmoid(scratch[basis + r])
 
 
 def ray_backward(field, d, scratch, grad):
     """Adjoint of `ray_setup`; clears the gradient."""
-    params, d_basis, h = field.params, np.uint64(AT + D_BASIS), np.uint64(AT + H + (LAYERS - 1) * HIDDEN)
-    d_h, d_before, last = np.uint64(AT + D_H), np.uint64(AT + D_BEFORE), np.uint64(field.layers[LAYERS])
+    d_basis = np.uint64(AT + D_BASIS)
     if SQUASHED:
         for r in range(np.uint64(OUTPUTS)):
             made = scratch[np.uint64(AT + BASIS) + r]
             scratch[d_basis + r] *= made * (1 - made)
-    dense_backward(HIDDEN, OUTPUTS, params, last, scratch, h, True, scratch, d_basis, scratch, d_h, grad)
-    for back in range(1, LAYERS):
-        layer, h = np.uint64(field.layers[LAYERS - back]), h - np.uint64(HIDDEN)
-        dense_backward(HIDDEN, HIDDEN, params, layer, scratch, h, True, scratch, d_h, scratch, d_before, grad)
-        d_h, d_before = d_before, d_h
-    x, first = np.uint64(AT + INPUT), np.uint64(field.layers[0])
-    dense_backward(INPUTS, HIDDEN, params, first, scratch, x, False, scratch, d_h, scratch, d_before, grad)
+    network_backward(
+        INPUTS, HIDDEN, LAYERS, 0, OUTPUTS, field.params, field.layers, scratch, np.uint64(AT + INPUT),
+        np.uint64(AT + H), d_basis, np.uint64(AT + D_H), np.uint64(AT + D_BEFORE), np.uint64(AT + D_INPUT),
+        grad,
+    )  # fmt: skip
     for r in range(np.uint64(OUTPUTS)):
         scratch[d_basis + r] = 0
 

@@ -1,6 +1,6 @@
 """Products of planes: features Π_m P_m,r(a, b) over the planes xy, xz and yz, of grids of several
-resolutions, side by side or summed (K-Planes, Fridovich-Keil et al., CVPR 2023, eq. 1). With `lines` three lines along the
-axes are factors as well: what its planes of an axis and time are at one time."""
+resolutions, side by side or summed (K-Planes, Fridovich-Keil et al., CVPR 2023, eq. 1). With `lines` three
+lines along the axes are factors as well: what its planes of an axis and time are at one time."""
 
 from typing import Annotated, NamedTuple
 

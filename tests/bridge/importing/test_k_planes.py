@@ -39,6 +39,7 @@ MODELS = {
     "moving": Model(times=9),
     "explicit, moving": Model(explicit=True, times=4),
     "contracted": Model(contracted=(2.5, 2.5, 2.5), codes=8),
+    "stretched": Model(contracted=(10.0, 6.0, 4.0), explicit=True, codes=8),
 }
 
 

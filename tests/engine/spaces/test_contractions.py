@@ -48,6 +48,7 @@ CURVED = {
     "DVGO L2": space_of(contracted_l2, **DVGO),
     "DVGO Linf": space_of(contracted_linf, **DVGO),
     "svox2": space_of(contracted_l2, contracted_density=2.0),
+    "stretched": space_of(contracted_linf, stretch_x=0.6, stretch_y=2.0, **DVGO),
 }
 NEW = CURVED | {"NDC": ndc, "NDC of a camera": space_of(ndc, scale_x=2.1, scale_y=2.8)}
 ALL = {"box": bounded, "unbounded": unbounded} | NEW
@@ -105,6 +106,7 @@ FORMULAS = {
     "DVGO L2": lambda x: dvgo_contraction(x, 2, 0.2),
     "DVGO Linf": lambda x: dvgo_contraction(x, np.inf, 0.2),
     "svox2": lambda x: scene_contraction(x, 2),
+    "stretched": lambda x: dvgo_contraction(x * [0.6, 2.0, 1.0], np.inf, 0.2),
     "NDC": lambda x: ndc_of(x, 2, 2, 1.0),
     "NDC of a camera": lambda x: ndc_of(x, 300, 400, 420.0),
 }

@@ -32,12 +32,15 @@ from fusedrf_cli.engine.encodings import (
     sparse_rows,
     spheres,
     trunk_features,
+    warped_frequencies,
 )
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 from fusedrf_cli.engine.fields.box import MAX_ANSWER
 from fusedrf_cli.engine.kernels.assembled import READS, assemble
 
-ENCODINGS = plane_line, line, grid, sparse_grid, spheres, hash_grid, planes, frequencies
+ENCODINGS = (
+    plane_line, line, grid, sparse_grid, spheres, hash_grid, planes, frequencies, warped_frequencies
+)  # fmt: skip
 PARTS: dict[str, tuple[ModuleType, ...]] = {
     "density": ENCODINGS,
     "colour": (*(part for part in ENCODINGS if part is not sparse_grid), sparse_rows, trunk_features),
@@ -45,8 +48,8 @@ PARTS: dict[str, tuple[ModuleType, ...]] = {
     "rgb": (rgb, sh, sh_basis, direction_basis, direction_texture, mlp),
 }
 """What may fill each slot, by the names of their modules."""
-FARTHEST = 1e4
-"""From 0, of a box whose points are encoded as they are: `frequencies.bound` counts on it."""
+FARTHEST = warped_frequencies.FARTHEST
+"""From 0, of a box whose points are encoded as they are: `bound` of those encodings counts on it."""
 
 
 def name_of(module: ModuleType) -> str:
@@ -142,8 +145,9 @@ class PartsField(AssembledField):
 
     def check_answers(self) -> None:
         """See BoxField."""
-        encoded = [entry for entry in self.shape.entries.values() if entry.get("frame")]
-        if encoded and np.abs(self.box).max() > FARTHEST:
+        encodings = [slot for slot in self.slots.values() if slot.module in ENCODINGS]
+        framed = [s.options.get("frame", s.module is warped_frequencies) for s in encodings]
+        if any(framed) and np.abs(self.box).max() > FARTHEST:
             raise ValueError(f"the box of points that are encoded should lie within {FARTHEST:g} of 0")
         sigma = self.slots["sigma"].sizes
         if sigma["ACTIVATION"] == 1 and self.scale * np.exp(sigma["HIGHEST"]) > MAX_ANSWER:
