@@ -26,6 +26,7 @@ MOST_CELLS = 256
 """Along an axis."""
 SH, TEXTURE, NETWORK = 1, 4, 255
 """Of `basis_type`."""
+NDC = "it was learnt in NDC of its cameras, whose lenses it does not tell: it lies as it is there"
 MLP = "pt__basis_mlp__"
 """In front of the names of its layers."""
 
@@ -42,7 +43,8 @@ def read(checkpoint) -> Imported:
     nodes = [grid_of(entries, middle, radius)]
     if "background_links" in entries.values:
         nodes = [replace(nodes[0], suffix=" grid"), background_of(entries, middle, radius)]
-    return Imported(nodes, rule="add")
+    in_ndc = checkpoint.beside.get("args.json", {}).get("dataset_type") == "llff"
+    return Imported(nodes, [NDC] * in_ndc, rule="add")
 
 
 def links_of(entries: Entries, name: str, dimensions: int, most: int) -> np.ndarray:

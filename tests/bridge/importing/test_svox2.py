@@ -244,6 +244,20 @@ def test_a_field_comes_back_from_its_file_as_it_was(tmp_path):
             assert torch.equal(back.params, node.field.params)
 
 
+def test_a_forward_facing_scene_is_said_to_lie_in_ndc(tmp_path):
+    (tmp_path / "args.json").write_text('{"dataset_type": "llff", "near_clip": 0.0}')
+    imported = svox2.read(write(tmp_path / "ckpt.npz", entries_of(SAVED["harmonics"])))
+    assert "NDC" in imported.notes[0]
+
+
+def test_nothing_dense_is_an_empty_field(tmp_path):
+    entries = entries_of(SAVED["harmonics"])
+    entries["density_data"] = -abs(entries["density_data"])
+    (node,) = svox2.read(write(tmp_path / "a.npz", entries)).nodes
+    assert not node.field.occupancy.occupied.any()
+    type(node.field).from_state(*node.field.state())
+
+
 @pytest.mark.slow
 def test_the_command_and_the_scene_that_it_writes(tmp_path):
     """Grid and background add up, as compiled loops answer."""
