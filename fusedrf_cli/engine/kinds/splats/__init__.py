@@ -3,7 +3,7 @@
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.kinds.builder import Suitability
 from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.splats.field import SplatsField
+from fusedrf_cli.engine.kinds.splats.field import ARRAYS, SplatsField
 from fusedrf_cli.engine.kinds.sweeps import Sweep
 
 
@@ -22,6 +22,18 @@ class SplatsKind(Kind):
     def sweeps(self, least_psnr: float) -> dict[str, list[Sweep]]:
         """See Kind."""
         return {}
+
+    def on_one_grid(self, field: SplatsField) -> SplatsField:
+        """See Kind: cells are cut, and splats stay whole."""
+        return field
+
+    def trimmed(self, field: SplatsField) -> SplatsField:
+        """See Kind."""
+        held = field.held
+        if held.all() or not held.any():
+            return field
+        kept = (getattr(field, name)[held] for name in ARRAYS)
+        return SplatsField(*kept, field.occupancy, field.cells)
 
     def describe(self, field: SplatsField) -> dict:
         """See Kind."""

@@ -3,9 +3,10 @@ along a ray.
 
 With u = W (x - μ) and v = W d, W = S⁻¹ Rᵀ the map that makes a splat a sphere of unit variance, a ray passes
 it at the distance |u × v| / |v|, where splatting (Kerbl et al. 2023) gives it the opacity
-α = o exp(-|u × v|² / 2 |v|²). Its optical depth -ln(1 - α) is spread along the ray as the Gaussian is: a
-stretch of length Δ around x has the share Φ(s + w) - Φ(s - w) of it, with s = u·v / |v| and w = Δ |v| / 2. So
-the samples of a ray, Δ apart, have all of it together, wherever they lie, and however thin the splat is."""
+α = o exp(-|u × v|² / 2 |v|²). Its optical depth -ln(1 - α) is spread along the ray as the Gaussian is, and by
+a tent of half the width Δ: with s = u·v / |v|, w = Δ |v| and Ψ'' the density of the normal distribution, x has
+(Ψ(s + w) - 2 Ψ(s) + Ψ(s - w)) / (w Δ) of it for a unit of length. So the samples of a ray, Δ apart, have all of
+it together, wherever they lie and however thin the splat is, and samples nearer to each other nearly so."""
 
 import math
 from typing import NamedTuple
@@ -15,7 +16,7 @@ import numpy as np
 from fusedrf_cli.engine.kernels.primitives import sh_basis
 
 KEPT_SPLATS = 64  # of a sample, whose densities wait for its colour
-TABLE = 2048  # entries of Φ over [-EDGE, EDGE]; linear between them it is right to 1e-6
+TABLE = 2048  # entries of Ψ over [-EDGE, EDGE]; linear between them it is right to 1e-6
 EDGE = 4.0
 ROW = 16  # numbers of a splat beside its colour: μ (3), W (9), o, the largest |u × v|² / |v|², and two more
 MOST_OPAQUE = 0.99  # as splatting has it
@@ -34,7 +35,7 @@ class Arrays(NamedTuple):
     cell: object  # (3,) float64
     counts: object  # (3,) int64
     length: object  # float, Δ
-    table: object  # (TABLE + 1,) float, Φ
+    table: object  # (TABLE + 1,) float, Ψ(x) = x Φ(x) + φ(x)
 
 
 def sizes(field) -> dict[str, int]:
@@ -45,12 +46,15 @@ def sizes(field) -> dict[str, int]:
 # -- compiled ------------------------------------------------------------------------------------------------
 
 
-def normal_cdf(field, x):
-    """Φ(x)."""
-    at = min(max(x + field.params.dtype.type(EDGE), 0), 2 * EDGE) * (TABLE / (2 * EDGE))
+def ramp(field, x):
+    """Ψ(x), which is 0 and then x but around 0."""
+    real = field.params.dtype.type
+    if abs(x) >= real(EDGE):
+        return max(x, real(0))
+    at = (x + real(EDGE)) * real(TABLE / (2 * EDGE))
     i = min(int(at), TABLE - 1)
     below = field.table[i]
-    return below + (at - i) * (field.table[i + 1] - below)
+    return below + (at - real(i)) * (field.table[i + 1] - below)
 
 
 def cell_number(field, p):
@@ -88,12 +92,12 @@ def density_of(field, splat, p, d):
     if apart > params[row + np.uint64(13)] * vv:
         return real(0)
     v = math.sqrt(vv)
-    s, half = (u0 * v0 + u1 * v1 + u2 * v2) / v, real(0.5) * field.length * v
-    if abs(s) - half > real(REACH):
+    s, wide = (u0 * v0 + u1 * v1 + u2 * v2) / v, field.length * v
+    if abs(s) - wide > real(REACH):
         return real(0)
     alpha = min(params[row + np.uint64(12)] * math.exp(real(-0.5) * apart / vv), real(MOST_OPAQUE))
-    share = normal_cdf(field, s + half) - normal_cdf(field, s - half)
-    return real(-math.log(real(1) - alpha) * share / field.length)
+    share = ramp(field, s + wide) - real(2) * ramp(field, s) + ramp(field, s - wide)
+    return real(-math.log(real(1) - alpha) * share / (wide * field.length))
 
 
 def is_kept(scratch, p, d):
@@ -123,6 +127,11 @@ def density(field, grid, index, p, d, scratch):
     for a in range(3):
         scratch[KEPT_AT + 1 + a], scratch[KEPT_AT + 4 + a] = p[a], d[a]
     return total, 0.0, 1, number
+
+
+def pack_cell(cell):
+    """See loops.py."""
+    return cell
 
 
 def ray_setup(field, d, scratch):

@@ -25,12 +25,15 @@ from fusedrf_cli.engine.kinds.splats.device_functions import EDGE, MOST_OPAQUE, 
 
 FAINTEST = 1 / 255  # opacity from which splatting draws
 STEPS_PER_CELL = 2
-MOST_CELLS = 256
+MOST_CELLS = 384
 """Along the longest side."""
-PER_SPLAT = 96
+PER_SPLAT = 120
 """Cells that a splat may be in, on the mean: with more, cells are made larger."""
 NEAR_ALL = 0.995
 """Share of the splats that the cells are made for: a capture has a few far away, some as large as all."""
+
+
+ARRAYS = "centres", "scales", "rotations", "opacities", "harmonics"
 
 
 class SplatsField(ComputedField):
@@ -56,7 +59,7 @@ class SplatsField(ComputedField):
         self.centres, self.scales, self.rotations = centres, scales, rotations
         self.opacities, self.harmonics = opacities, harmonics
         self.cells = cells or cells_for(self)
-        self.first, self.members = members_of(centres, self.axes, self.extents, self.cells, self.step / 2)
+        self.first, self.members = members_of(centres, self.axes, self.extents, self.cells, self.step)
         self.params = torch.from_numpy(rows_of(self))
         held = (np.diff(self.first) > 0).reshape(self.cells.occupied.shape)
         self.occupancy = self.cells.marked(held) if occupancy is None else occupancy
@@ -68,7 +71,7 @@ class SplatsField(ComputedField):
         return Arrays(
             params, np.int64(len(self.centres) * ROW), self.first, self.members, self.cells.aabb[:3].copy(),
             self.cells.cell, np.array(self.cells.occupied.shape, np.int64), self.real.type(self.step),
-            cdf_table().astype(self.real),
+            ramp_table().astype(self.real),
         )  # fmt: skip
 
     @property
@@ -120,6 +123,25 @@ class SplatsField(ComputedField):
         """(6,) that of its cells."""
         return self.cells.aabb
 
+    over_texels = False
+
+    @property
+    def resolution(self) -> tuple[int, ...]:
+        """Corners of its cells per axis, on which parts of it are cut."""
+        return tuple(n + 1 for n in self.cells.occupied.shape)
+
+    @property
+    def held(self) -> np.ndarray:
+        """(N,) bool: the splats that reach into an occupied cell."""
+        at = ((self.occupancy.centres() - self.box[:3]) / self.cells.cell).astype(np.int64)
+        last = np.array(self.cells.occupied.shape) - 1
+        numbers = np.ravel_multi_index(tuple(np.clip(at, 0, last).T), self.cells.occupied.shape)
+        cells = np.zeros(len(self.first) - 1, bool)
+        cells[numbers] = True
+        held = np.zeros(len(self.centres), bool)
+        held[self.members[np.repeat(cells, np.diff(self.first))]] = True
+        return held
+
     def reference(
         self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -134,10 +156,10 @@ class SplatsField(ComputedField):
         v = torch.einsum("nij,pj->pni", rows[:, 3:12].view(count, 3, 3), along)
         length = v.norm(dim=2)
         apart = torch.linalg.cross(u, v).square().sum(2) / length.square()
-        s, half = (u * v).sum(2) / length, 0.5 * self.step * length
+        s, wide = (u * v).sum(2) / length, self.step * length
         alpha = (rows[:, 12] * torch.exp(-0.5 * apart)).clamp_max(MOST_OPAQUE)
-        share = torch.special.ndtr(s + half) - torch.special.ndtr(s - half)
-        near = (apart <= rows[:, 13]) & (s.abs() - half <= REACH)
+        share = (ramp(s + wide) - 2 * ramp(s) + ramp(s - wide)) / wide
+        near = (apart <= rows[:, 13]) & (s.abs() - wide <= REACH)
         sigma = torch.where(near, -torch.log1p(-alpha) * share / self.step, 0)
         basis = sh_basis(self.coefficients, along)
         rgb = (0.5 + torch.einsum("pk,nkc->pnc", basis, colours)).relu()
@@ -157,7 +179,8 @@ class SplatsField(ComputedField):
         }  # fmt: skip
         cells = {"aabb": self.cells.aabb.tolist(), "counts": list(self.cells.occupied.shape)}
         metadata = {"splats": len(self.centres), "cells": cells}
-        if not np.array_equal(self.occupancy.occupied.ravel(), np.diff(self.first) > 0):
+        as_held = np.array_equal(self.occupancy.occupied.ravel(), np.diff(self.first) > 0)
+        if not (as_held and np.array_equal(self.occupancy.aabb, self.box)):
             arrays |= packed_bits("occupancy", self.occupancy.occupied)
             metadata["occupancy"] = {
                 "aabb": self.occupancy.aabb.tolist(), "counts": list(self.occupancy.occupied.shape)
@@ -216,9 +239,14 @@ class SplatsField(ComputedField):
         return cls(centres, scales, rotations / norms, opacities, colours, occupancy, cells)
 
 
-def cdf_table() -> np.ndarray:
-    """(TABLE + 1,) Φ between -EDGE and EDGE."""
-    return torch.special.ndtr(torch.linspace(-EDGE, EDGE, TABLE + 1, dtype=torch.float64)).numpy()
+def ramp_table() -> np.ndarray:
+    """(TABLE + 1,) Ψ between -EDGE and EDGE."""
+    return ramp(torch.linspace(-EDGE, EDGE, TABLE + 1, dtype=torch.float64)).numpy()
+
+
+def ramp(x: torch.Tensor) -> torch.Tensor:
+    """Ψ(x) = x Φ(x) + φ(x)."""
+    return x * torch.special.ndtr(x) + torch.exp(-0.5 * x * x) / (2 * torch.pi) ** 0.5
 
 
 def checked_counts(values: list) -> tuple[int, int, int]:
@@ -253,7 +281,7 @@ def cells_for(field: SplatsField) -> OccupancyGrid:
     box = np.concatenate([np.quantile(lows, margin, axis=0), np.quantile(highs, 1 - margin, axis=0)])
     sides = box[3:] - box[:3]
     box[3:] += np.maximum(1e-3 * sides.max(), 1e-9) * (sides <= 0)
-    for longest in (MOST_CELLS, 192, 128, 96, 64, 48, 32, 16, 8):
+    for longest in (MOST_CELLS, 256, 192, 128, 96, 64, 48, 32, 16, 8):
         counts = cell_counts(box, longest)
         cell = (box[3:] - box[:3]) / counts
         spans = np.clip(np.minimum(highs, box[3:]) - np.maximum(lows, box[:3]), 0, None) / cell + 1
