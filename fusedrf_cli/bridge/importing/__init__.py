@@ -38,10 +38,14 @@ READERS = {
     "nerfacto": ("nerfacto", "read"),
     "nerf-pytorch": ("nerf", "read"),
     "krrish-nerf": ("nerf", "read_krrish"),
+    "k-planes": ("k_planes", "read"),
+    "d2nerf": ("d2nerf", "read"),
 }
 """The module and the function that read a system's checkpoint."""
-BOXLESS = "nerf-pytorch", "krrish-nerf"
+BOXLESS = "nerf-pytorch", "krrish-nerf", "d2nerf"
 """Systems whose files have no box."""
+MOVING = "k-planes", "d2nerf"
+"""Systems whose scenes may move."""
 COPIES = 4.0
 """Of an array, of what its field takes: read, rearranged, as numbers and as they are written."""
 
@@ -90,7 +94,8 @@ def bytes_of(entries: object) -> float:
     if isinstance(entries, StoredTensor):
         return 4.0 * np.prod(entries.shape, dtype=float)
     if isinstance(entries, dict):
-        return sum(bytes_of(value) for key, value in entries.items() if "optim" not in str(key))
+        kept = (key for key in entries if "optim" not in str(key) or "target" in entries[key])
+        return sum(bytes_of(entries[key]) for key in kept if key != "param_states")
     return float(len(entries)) if isinstance(entries, bytes) else 0.0
 
 
@@ -101,9 +106,10 @@ def imported_from(checkpoint: Checkpoint, request: ImportRequest, capture: Captu
     boxless = checkpoint.system in BOXLESS
     if not boxless and (request.aabb or request.near or request.far):
         raise UsageProblem("--aabb, --near and --far are for files without a box, and this one has its own")
-    box = [box_of(request, capture)] if boxless else []
+    given = {"box": box_of(request, capture)} if boxless else {}
+    given |= {"time": request.time} if checkpoint.system in MOVING else {}
     try:
-        return read(checkpoint, *box)
+        return read(checkpoint, **given)
     except (FormatError, ValueError) as error:
         raise InvalidInput(f"{checkpoint.path}: {error}") from error
 

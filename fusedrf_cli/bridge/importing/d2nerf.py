@@ -109,8 +109,8 @@ def read(checkpoint, box: np.ndarray, time: float | None = None) -> Imported:
     if dynamic.shadow is not None:
         notes.append("the shadow of what moves darkens the static field, also where that is shown alone")
     nodes = [
-        ImportedNode(static_field(model, dynamic, box), suffix="static"),
-        ImportedNode(dynamic.field(box), suffix="dynamic"),
+        ImportedNode(static_field(model, dynamic, box), suffix="-static"),
+        ImportedNode(dynamic.field(box), suffix="-dynamic"),
     ]
     return Imported(nodes, notes, "add")
 

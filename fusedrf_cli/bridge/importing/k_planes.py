@@ -29,6 +29,7 @@ from fusedrf_cli.engine.spaces import bounded, contracted_linf, space_of
 
 FIELD = "field."
 MOST_SAMPLES = 512  # vertices along an axis by which rays are sampled
+MARGIN = 1 / 3  # on each side of a box, of what has the values of its border
 HIDDEN, BASIS_HIDDEN = 64, 128  # neurons of its networks
 GEOMETRY = 15  # features that the density's network makes for the colour
 SHIFT = -1.0  # of what is exponentiated
@@ -47,10 +48,15 @@ def read(checkpoint, time: float | None = None) -> Imported:
     elif time is not None:
         notes.append("its scene stands still: no time is needed")
     box, flipped, placement, space, scale = where(state)
+    margin = MARGIN if space is bounded and not settings.get("ndc") else 0.0
+    if margin:
+        notes.append(f"its box is {box.round(4).tolist()}, and around it the values on its border go on")
+        reach = (box[3:] - box[:3]) * margin / (1 - 2 * margin)
+        box = box + np.concatenate([-reach, reach])
     features, width = grids[0][0].shape[-1], eight(grids[0][0].shape[-1])
     encoding, values = planes_of(grids, width, flipped)
     sigma_net, summed = density_net(state, features, len(grids), settings)
-    encoding["summed"] = summed
+    encoding |= {"summed": summed, "margin": margin}
     columns = np.concatenate([s * width + np.arange(features) for s in range(1 if summed else len(grids))])
     codes = codes_of(state, notes)
     rest = {"activation": activation_of(settings, notes), "limits": list(LIMITS)}
@@ -58,7 +64,8 @@ def read(checkpoint, time: float | None = None) -> Imported:
     decoders = explicit_decoders if explicit else hybrid_decoders
     sigma, rgb, more = decoders(state, sigma_net, columns, width * (1 if summed else len(grids)), codes, rest)
     shape = PartsShape(encoding, {"part": "trunk_features"}, sigma, rgb)
-    resolution = np.minimum(np.max(encoding["scales"], 0), MOST_SAMPLES)
+    vertices = np.minimum(np.max(encoding["scales"], 0), MOST_SAMPLES)
+    resolution = np.rint((vertices - 1) / (1 - 2 * margin)) + 1
     cells = OccupancyGrid.full(box, space=space)
     field = parts_field(shape, box, resolution, values | more, scale, occupancy=cells)
     if settings.get("ndc"):

@@ -1,6 +1,7 @@
 """Products of planes: features Π_m P_m,r(a, b) over the planes xy, xz and yz, of grids of several
 resolutions, side by side or summed (K-Planes, Fridovich-Keil et al., CVPR 2023, eq. 1). With `lines` three
-lines along the axes are factors as well: what its planes of an axis and time are at one time."""
+lines along the axes are factors as well: what its planes of an axis and time are at one time. In a `margin`
+of the box, which is that share of its sides wide, features are those on the border of what is in it."""
 
 from typing import Annotated, NamedTuple
 
@@ -24,9 +25,10 @@ class Options(msgspec.Struct, forbid_unknown_fields=True):
 
     features: Rank
     scales: Annotated[list[tuple[Texels, Texels, Texels]], Meta(min_length=1, max_length=16)]
-    """Texels per axis, corners on the faces of the box, of each grid."""
+    """Texels per axis of each grid, corners on the faces of the box, or on those inside of a margin."""
     summed: bool = False
     lines: bool = False
+    margin: Annotated[float, Meta(ge=0, le=0.49)] = 0.0
 
 
 class Arrays(NamedTuple):
@@ -36,17 +38,20 @@ class Arrays(NamedTuple):
     counts: object  # (3 SCALES,) int64, texels per axis
 
 
-def sizes(features: int, scales: list, summed: bool = False, lines: bool = False) -> dict[str, int]:
+def sizes(
+    features: int, scales: list, summed: bool = False, lines: bool = False, margin: float = 0.0
+) -> dict[str, int | float]:
     """See encodings; scratch holds the factors at a point, and the gradient of one."""
     factors = 6 if lines else 3
     return {
         "FEATURES": features, "SCALES": len(scales), "FACTORS": factors, "SUMMED": int(summed),
         "WIDTH": features * (1 if summed else len(scales)), "ROOM": (factors + 1) * features,
+        "MARGIN": float(margin),
     }  # fmt: skip
 
 
 def sections(
-    resolution: tuple, features: int, scales: list, summed: bool = False, lines: bool = False
+    resolution: tuple, features: int, scales: list, lines: bool = False, **options
 ) -> list[ParameterBlock]:
     """See encodings."""
     blocks = []
@@ -65,10 +70,10 @@ def arrays(field, starts: np.ndarray, features: int, scales: list, **options) ->
 
 def reference(
     field, sections: dict, unit: torch.Tensor, read: None, features: int, scales: list, summed: bool = False,
-    lines: bool = False,
+    lines: bool = False, margin: float = 0.0,
 ) -> torch.Tensor:  # fmt: skip
     """See encodings."""
-    made = []
+    unit, made = ((unit - margin) / (1 - 2 * margin)).clamp(0, 1), []
     for s in range(len(scales)):
         product = 1
         for m, (a, b) in enumerate(AXES[:3]):
@@ -81,7 +86,7 @@ def reference(
 
 
 def bound(
-    sections: dict, read: None, features: int, scales: list, summed: bool = False, lines: bool = False
+    sections: dict, read: None, features: int, scales: list, summed: bool = False, **options
 ) -> torch.Tensor:
     """See encodings."""
     peaks = torch.stack([largest(view, kept=1) for view in sections.values()])
@@ -96,7 +101,7 @@ def below(field, scale, axis, unit):
     """The texel below a point on an axis of a grid, and the share of the one above."""
     last = field.counts[3 * scale + axis] - 1
     u = unit[0] if axis == 0 else (unit[1] if axis == 1 else unit[2])
-    at = min(max(u, 0.0), 1.0) * last
+    at = min(max((u - MARGIN) / (1.0 - 2.0 * MARGIN), 0.0), 1.0) * last
     i = min(int(at), last - 1)
     return i, at - i
 

@@ -12,6 +12,7 @@ from scipy.linalg import expm
 from formats.errors import FormatError
 from formats.foreign.systems import open_checkpoint
 from fusedrf_cli.bridge.importing import d2nerf
+from tests.bridge.importing.test_k_planes import stored
 from tests.formats.foreign.samples import flax_array
 
 BOX = np.array([-1.5, -1.0, -1.0, 1.0, 1.5, 2.0])
@@ -233,7 +234,7 @@ def samples(count: int = 60) -> tuple[np.ndarray, np.ndarray]:
 
 
 def asked(node, points, dirs) -> tuple[np.ndarray, np.ndarray]:
-    field = node.field
+    field = stored(node.field)
     found = field.answers(field.params, torch.from_numpy(points), torch.from_numpy(dirs))
     return tuple(value.numpy() for value in found)
 
@@ -250,7 +251,7 @@ def test_static_and_dynamic_fields_answer_by_d2nerfs_formulas(model, time, tmp_p
     lit = expected["rgb_static"] * (1 - expected["shadow"])[:, None]
     np.testing.assert_allclose(static[1], lit, atol=1e-4)
     np.testing.assert_allclose(dynamic[1], expected["rgb_dynamic"], atol=1e-4)
-    assert imported.rule == "add" and [node.suffix for node in imported.nodes] == ["static", "dynamic"]
+    assert imported.rule == "add" and [node.suffix for node in imported.nodes] == ["-static", "-dynamic"]
     assert any("shadow" in note for note in imported.notes) == bool(model.shadow)
 
 

@@ -51,6 +51,7 @@ BY_ALL = [{"scale": 5.0, "side": 5, "rows": 32, "hashed": True, "offset": 0.0}] 
 WARP = {"count": 2, "hidden": 8, "layers": 3, "skip": 2}
 SHEET = {"count": 3, "hidden": 16, "layers": 1, "skip": 0}
 WARPED = {"count": 1, "warp": WARP, "sheet": SHEET, "coordinates": 3, "coordinate_count": 2}
+PLANES = {"features": 8, "scales": [(4, 3, 5), (7, 6, 2)]}
 DENSITIES = {
     "line": (line, {"rank": 8}),
     "plane_line": (plane_line, {"rank": 8}),
@@ -60,11 +61,8 @@ DENSITIES = {
     "plane_line_hash": (plane_line_hash, {"rank": 8, "hashed": RUNS}),
     "frequencies": (frequencies, {"count": 2}),
     "frame_frequencies": (frequencies, {"count": 3, "frame": True}),
-    "planes": (planes, {"features": 8, "scales": [(4, 3, 5), (7, 6, 2)]}),
-    "planes_lines": (
-        planes,
-        {"features": 8, "scales": [(4, 3, 5), (7, 6, 2)], "summed": True, "lines": True},
-    ),
+    "planes": (planes, PLANES),
+    "planes_lines": (planes, PLANES | {"summed": True, "lines": True, "margin": 0.3}),
     "warped_frequencies": (warped_frequencies, WARPED),
     "still_too": (warped_frequencies, WARPED | {"still": True, "warp": SHEET, "sheet": WARP}),
     "always_hashed": (hash_grid, {"features": 2, "levels": BY_ALL}),
