@@ -41,8 +41,8 @@ def read(checkpoint) -> Imported:
     if not (radius > 0).all():
         raise FormatError("'radius' should be above 0")
     nodes = [grid_of(entries, middle, radius)]
-    if "background_links" in entries.values:
-        nodes = [replace(nodes[0], suffix=" grid"), background_of(entries, middle, radius)]
+    if background := background_of(entries, middle, radius):
+        nodes = [replace(nodes[0], suffix=" grid"), background]
     in_ndc = checkpoint.beside.get("args.json", {}).get("dataset_type") == "llff"
     return Imported(nodes, [NDC] * in_ndc, rule="add")
 
@@ -175,10 +175,14 @@ def cells_around(voxels: tuple[np.ndarray, ...], dense: np.ndarray, counts: np.n
 # -- the background ------------------------------------------------------------------------------------------
 
 
-def background_of(entries: Entries, middle: np.ndarray, radius: np.ndarray) -> ImportedNode:
-    """The spheres around the unit ball of the box. Their σ is per growth of -1/rho, rho counted in radii,
-    times the world's length of a radius in the ray's direction."""
+def background_of(entries: Entries, middle: np.ndarray, radius: np.ndarray) -> ImportedNode | None:
+    """The spheres around the unit ball of the box, if any. Their σ is per growth of -1/rho, rho counted in
+    radii, times the world's length of a radius in the ray's direction."""
+    if "background_links" not in entries.values:
+        return None
     links = links_of(entries, "background_links", 2, MAX_ROWS)
+    if links.max() < 0:
+        return None
     data = entries.array("background_data", None, None, 4)
     check_rows(links, len(data), "columns of 'background_data'")
     layers = data.shape[1]

@@ -258,6 +258,13 @@ def test_nothing_dense_is_an_empty_field(tmp_path):
     type(node.field).from_state(*node.field.state())
 
 
+def test_a_background_of_which_nothing_is_held_is_none(tmp_path):
+    entries = entries_of(SAVED["background"])
+    entries["background_links"][:] = -1
+    entries["background_data"] = entries["background_data"][:0]
+    assert len(svox2.read(write(tmp_path / "a.npz", entries)).nodes) == 1
+
+
 @pytest.mark.slow
 def test_the_command_and_the_scene_that_it_writes(tmp_path):
     """Grid and background add up, as compiled loops answer."""
