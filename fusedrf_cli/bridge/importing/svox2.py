@@ -34,10 +34,7 @@ MLP = "pt__basis_mlp__"
 def read(checkpoint) -> Imported:
     """The fields of a file: a grid, and the background around it, if any. Raises FormatError."""
     entries = Entries(checkpoint.entries)
-    middle, radius = (
-        np.broadcast_to(entries.array(name).astype(np.float64), 3) if name in entries.values else default
-        for name, default in (("center", np.zeros(3)), ("radius", np.ones(3)))
-    )
+    middle, radius = triple_of(entries, "center", 0.0), triple_of(entries, "radius", 1.0)
     if not (radius > 0).all():
         raise FormatError("'radius' should be above 0")
     nodes = [grid_of(entries, middle, radius)]
@@ -45,6 +42,14 @@ def read(checkpoint) -> Imported:
         nodes = [replace(nodes[0], suffix=" grid"), background]
     in_ndc = checkpoint.beside.get("args.json", {}).get("dataset_type") == "llff"
     return Imported(nodes, [NDC] * in_ndc, rule="add")
+
+
+def triple_of(entries: Entries, name: str, usual: float) -> np.ndarray:
+    """A number for each axis (3,), which may be the same for all."""
+    value = entries.array(name) if name in entries.values else np.float64(usual)
+    if value.size not in (1, 3):
+        raise FormatError(f"'{name}' should be three numbers, found {value.size}")
+    return np.resize(value.astype(np.float64), 3)
 
 
 def links_of(entries: Entries, name: str, dimensions: int, most: int) -> np.ndarray:

@@ -289,6 +289,7 @@ REFUSED = {
     "a link to no row": ("background", "links", np.full(COUNTS, 1000, np.int32), "more than the last link"),
     "links on no grid": ("harmonics", "links", np.zeros((4, 4), np.int32), "whole numbers on a grid"),
     "a flat box": ("harmonics", "radius", np.float32([1, 0, 1]), "above 0"),
+    "two radii": ("harmonics", "radius", np.ones(2, np.float32), "three numbers, found 2"),
     "an unknown basis": ("harmonics", "basis_type", np.int64(3), "1, 4 or 255, found 3"),
     "no harmonics": ("harmonics", "basis_type", np.int64(4), "'basis_data' is missing"),
     "no cube": ("texture", "basis_data", np.zeros((4, 4, 3, 5), np.float32), "should be a cube"),
