@@ -93,8 +93,8 @@ def measured(folder: Path, kind: str) -> dict:
     psnr = said["psnr"]
     figures = {
         "PSNR as stored, dB": psnr["stored"],
-        "covered pixels": psnr["covered"],
-        "the worst object": psnr["worst_object"]["psnr"],
+        "covered pixels": psnr.get("covered"),
+        "the worst object": (psnr.get("worst_object") or {}).get("psnr"),
         "before rays": psnr["before_rgb"],
         "after": psnr["after_rgb"],
         "MB": said["bytes"] / 1e6,

@@ -17,7 +17,8 @@ from tests.bundles import write_single
 
 ROOT = Path(__file__).parents[2]
 BRIDGE_VERBS = (
-    *("pose", "train", "import_field", "fuse", "convert", "add", "delete", "move", "duplicate", "rename", "render"),
+    *("pose", "train", "import_field", "fuse", "convert", "add", "delete", "move", "duplicate", "rename"),
+    "render",
     *("evaluate", "chart", "extract", "replace", "show"),
 )
 

@@ -3,10 +3,10 @@ along a ray.
 
 With u = W (x - μ) and v = W d, W = S⁻¹ Rᵀ the map that makes a splat a sphere of unit variance, a ray passes
 it at the distance |u × v| / |v|, where splatting (Kerbl et al. 2023) gives it the opacity
-α = o exp(-|u × v|² / 2 |v|²). Its optical depth -ln(1 - α) is spread along the ray as the Gaussian is, and by
-a tent of half the width Δ: with s = u·v / |v|, w = Δ |v| and Ψ'' the density of the normal distribution, x has
-(Ψ(s + w) - 2 Ψ(s) + Ψ(s - w)) / (w Δ) of it for a unit of length. So the samples of a ray, Δ apart, have all of
-it together, wherever they lie and however thin the splat is, and samples nearer to each other nearly so."""
+α = o exp(-|u × v|² / 2 |v|²). Its optical depth -ln(1 - α) is spread along the ray as the Gaussian is, and
+by a tent of half the width Δ: with s = u·v / |v|, w = Δ |v| and Ψ'' the density of the normal distribution,
+x has (Ψ(s + w) - 2 Ψ(s) + Ψ(s - w)) / (w Δ) of it for a unit of length. So the samples of a ray, Δ apart,
+have all of it together, wherever they lie and however thin the splat is, and nearer ones nearly so."""
 
 import math
 from typing import NamedTuple
