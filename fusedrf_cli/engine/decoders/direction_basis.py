@@ -135,8 +135,8 @@ def ray_backward(field, d, scratch, grad):
             scratch[d_basis + r] *= made * (1 - made)
     network_backward(
         INPUTS, HIDDEN, LAYERS, 0, OUTPUTS, field.params, field.layers, scratch, np.uint64(AT + INPUT),
-        np.uint64(AT + H), d_basis, np.uint64(AT + D_H), np.uint64(AT + D_BEFORE), np.uint64(AT + D_INPUT),
-        grad,
+        np.uint64(AT + H), scratch, d_basis, np.uint64(AT + D_H), np.uint64(AT + D_BEFORE),
+        np.uint64(AT + D_INPUT), grad,
     )  # fmt: skip
     for r in range(np.uint64(OUTPUTS)):
         scratch[d_basis + r] = 0

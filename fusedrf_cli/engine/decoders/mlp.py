@@ -24,15 +24,8 @@ from fusedrf_cli.engine.decoders.sh_mlp import HARMONICS, OUTPUTS
 from fusedrf_cli.engine.fields.box import ParameterBlock
 from fusedrf_cli.engine.fields.part_options import Frequencies, Layers, Width
 from fusedrf_cli.engine.kernels import reference as torch_reference
-from fusedrf_cli.engine.kernels.primitives import (
-    add_scaled,
-    dense,
-    dense_backward,
-    dot,
-    rectify,
-    scatter,
-    sh_basis,
-)
+from fusedrf_cli.engine.kernels.networks import network, network_backward
+from fusedrf_cli.engine.kernels.primitives import add_scaled, dot, scatter, sh_basis
 
 
 class Options(msgspec.Struct, forbid_unknown_fields=True):
@@ -185,13 +178,7 @@ def forward(field, cell, d, scratch, memory, at):
         memory[x + rows + np.uint64(DIRECTIONS) + j] = scratch[np.uint64(AT + POINT) + j]
     encode(memory, x)
     h, last = base + np.uint64(FIRST), base + np.uint64(LAST)
-    dense(INPUTS, HIDDEN, params, np.uint64(field.layers[0]), memory, x, memory, h)
-    rectify(HIDDEN, memory, h)
-    for layer in range(1, LAYERS):
-        below, h = h, h + np.uint64(HIDDEN)
-        dense(HIDDEN, HIDDEN, params, np.uint64(field.layers[layer]), memory, below, memory, h)
-        rectify(HIDDEN, memory, h)
-    dense(HIDDEN, OUTPUTS, params, np.uint64(field.layers[LAYERS]), memory, h, memory, last)
+    network(INPUTS, HIDDEN, LAYERS, 0, OUTPUTS, params, field.layers, memory, x, h, last)
     r, g, b = plain_logits_at(memory, x, last)
     if DIMMED > 0:
         shadow = memory[base + np.uint64(DIMMED)]
@@ -232,8 +219,7 @@ def encode(memory, x):
 
 def backward(field, cell, d, d_logits, scratch, memory, at, grad):
     """See decoders."""
-    base, x, params = np.uint64(at), np.uint64(at + INPUT), field.params
-    d_last, d_h, d_before = np.uint64(AT + D_LAST), np.uint64(AT + D_HIDDEN), np.uint64(AT + D_BEFORE)
+    base, x, d_last = np.uint64(at), np.uint64(at + INPUT), np.uint64(AT + D_LAST)
     for r in range(np.uint64(OUTPUTS)):
         scratch[d_last + r] = 0
     d_shadow = 0.0
@@ -241,15 +227,10 @@ def backward(field, cell, d, d_logits, scratch, memory, at, grad):
         d_logits, d_shadow = dimmed_backward(base, x, d_logits, memory)
     for c in range(3):
         scratch[d_last + np.uint64(c)] = d_logits[c]
-    h = base + np.uint64(FIRST + (LAYERS - 1) * HIDDEN)
-    layer = np.uint64(field.layers[LAYERS])
-    dense_backward(HIDDEN, OUTPUTS, params, layer, memory, h, True, scratch, d_last, scratch, d_h, grad)
-    for back in range(1, LAYERS):
-        layer, h = np.uint64(field.layers[LAYERS - back]), h - np.uint64(HIDDEN)
-        dense_backward(HIDDEN, HIDDEN, params, layer, memory, h, True, scratch, d_h, scratch, d_before, grad)
-        d_h, d_before = d_before, d_h
-    layer, d_input = np.uint64(field.layers[0]), np.uint64(AT + D_INPUT)
-    dense_backward(INPUTS, HIDDEN, params, layer, memory, x, False, scratch, d_h, scratch, d_input, grad)
+    network_backward(
+        INPUTS, HIDDEN, LAYERS, 0, OUTPUTS, field.params, field.layers, memory, x, base + np.uint64(FIRST),
+        scratch, d_last, np.uint64(AT + D_HIDDEN), np.uint64(AT + D_BEFORE), np.uint64(AT + D_INPUT), grad,
+    )  # fmt: skip
     encode_backward(memory, x, scratch)
     if DIFFUSE:
         for c in range(3):

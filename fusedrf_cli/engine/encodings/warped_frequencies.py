@@ -312,7 +312,7 @@ def backward(field, unit, d, base, scratch, grad):
     scratch[d_out + 6], scratch[d_out + 7] = 0, 0
     network_backward(
         WARP_INPUTS, WARP_HIDDEN, WARP_LAYERS, WARP_SKIP, 8, field.params, field.warp, scratch,
-        np.uint64(AT + E), np.uint64(AT + WARP_H), np.uint64(d_out), np.uint64(AT + D_H),
+        np.uint64(AT + E), np.uint64(AT + WARP_H), scratch, np.uint64(d_out), np.uint64(AT + D_H),
         np.uint64(AT + D_BEFORE), np.uint64(AT + D_E), grad,
     )  # fmt: skip
     sheet_backward(field, d, base, scratch, grad)
@@ -355,6 +355,6 @@ def sheet_backward(field, d, base, scratch, grad):
         scratch[AT + D_OUT + j] = total
     network_backward(
         SHEET_INPUTS, SHEET_HIDDEN, SHEET_LAYERS, SHEET_SKIP, SHEET_OUTPUTS, field.params, field.sheet,
-        scratch, np.uint64(AT + E), np.uint64(AT + SHEET_H), np.uint64(AT + D_OUT), np.uint64(AT + D_H),
-        np.uint64(AT + D_BEFORE), np.uint64(AT + D_E), grad,
+        scratch, np.uint64(AT + E), np.uint64(AT + SHEET_H), scratch, np.uint64(AT + D_OUT),
+        np.uint64(AT + D_H), np.uint64(AT + D_BEFORE), np.uint64(AT + D_E), grad,
     )  # fmt: skip

@@ -35,28 +35,28 @@ def network(inputs, hidden, layers, skip, outputs, params, starts, values, x, h,
 
 @device
 def network_backward(
-    inputs, hidden, layers, skip, outputs, params, starts, values, x, h, d_out, d_h, d_before, d_x, grad
+    inputs, hidden, layers, skip, outputs, params, starts, values, x, h, sent, d_out, d_h, d_before, d_x, grad
 ):
-    """Adjoint of `network` for values[d_out : d_out + outputs]: adds to grad, and sets values[d_x : d_x +
-    inputs]. There is room for the gradients of a layer at d_h and d_before, and for another input's behind
-    d_x."""
+    """Adjoint of `network` for sent[d_out : d_out + outputs]: adds to grad, and sets sent[d_x : d_x +
+    inputs]. There is room in `sent` for the gradients of a layer at d_h and d_before, and where a layer reads
+    the input again, for that of another input behind d_x."""
     h += np.uint64((layers - 1) * hidden)
     again = d_x + np.uint64(inputs)
     last = np.uint64(starts[layers])
-    dense_backward(hidden, outputs, params, last, values, h, True, values, d_out, values, d_h, grad)
+    dense_backward(hidden, outputs, params, last, values, h, True, sent, d_out, sent, d_h, grad)
     for back in range(1, layers):
         layer = layers - back
         h -= np.uint64(hidden)
         start = np.uint64(starts[layer])
-        dense_backward(hidden, hidden, params, start, values, h, True, values, d_h, values, d_before, grad)
+        dense_backward(hidden, hidden, params, start, values, h, True, sent, d_h, sent, d_before, grad)
         if skip > 0 and layer == skip:
             for i in range(np.uint64(inputs)):
                 row = np.uint64(starts[layers + 1]) + i * np.uint64(hidden)
-                scatter(hidden, grad, row, values[x + i], values, d_h)
-                values[again + i] = dot(hidden, params, row, values, d_h)
+                scatter(hidden, grad, row, values[x + i], sent, d_h)
+                sent[again + i] = dot(hidden, params, row, sent, d_h)
         d_h, d_before = d_before, d_h
     first = np.uint64(starts[0])
-    dense_backward(inputs, hidden, params, first, values, x, False, values, d_h, values, d_x, grad)
+    dense_backward(inputs, hidden, params, first, values, x, False, sent, d_h, sent, d_x, grad)
     if skip > 0:
         for i in range(np.uint64(inputs)):
-            values[d_x + i] += values[again + i]
+            sent[d_x + i] += sent[again + i]

@@ -7,11 +7,14 @@ import msgpack
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 from scipy.linalg import expm
 
+from formats.bundle import read_bundle
 from formats.errors import FormatError
 from formats.foreign.systems import open_checkpoint
 from fusedrf_cli.bridge.importing import d2nerf
+from fusedrf_cli.main import cli
 from tests.bridge.importing.test_k_planes import stored
 from tests.formats.foreign.samples import flax_array
 
@@ -309,3 +312,17 @@ def test_shadows_of_other_skips_are_refused(tmp_path):
     model = replace(MODELS["as run"], shadow="model")
     with pytest.raises(FormatError, match="in different layers"):
         d2nerf.read(written(model, tmp_path, change), BOX, 1)
+
+
+def test_the_command_writes_a_group_whose_densities_add_up(tmp_path):
+    written(MODELS["as run"], tmp_path)
+    box, out = ",".join(map(str, BOX)), str(tmp_path / "a.rfpack")
+    words = ["import", str(tmp_path / "checkpoint_9"), "-o", out, "--aabb", box, "--name", "hand"]
+    done = CliRunner().invoke(cli, [*words, "--time", "3"])
+    assert done.exit_code == 0, done.output
+    (group,) = read_bundle(out).scene.nodes
+    assert group.composition == "add"
+    assert [child.name for child in group.children] == ["hand-static", "hand-dynamic"]
+    late = CliRunner().invoke(cli, [*words, "--time", "5", "-w"])
+    assert late.exit_code == 3 and "a time from 0 to 4 (--time) should be given, found 5" in late.output
+    assert CliRunner().invoke(cli, [*words[:4], "--time", "3", "-w"]).exit_code == 2  # nothing says where
