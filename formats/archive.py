@@ -25,6 +25,7 @@ from formats.errors import (
     ResourceError,
     TruncatedBundle,
 )
+from formats.other_files import HEAD, not_a_bundle
 from formats.safe_input import open_input
 
 ALIGNMENT = 64
@@ -99,7 +100,10 @@ def read_archive(path: Path | str, *, verify: bool = True) -> dict[str, memoryvi
     allow_files()
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
-        magic = file.read(len(MAGIC))
+        head = file.read(HEAD)
+        magic = head[: len(MAGIC)]
+        if (other := not_a_bundle(Path(path), head)) is not None:
+            raise other
         if magic != MAGIC:
             raise NotABundle(f"{path}: begins with {magic!r}, expected an .rfpack bundle ({MAGIC!r})")
         if size > MAX_ARCHIVE:

@@ -6,11 +6,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from formats.errors import BadMesh, FormatError, MissingExtra, NotACapture, counted
+from formats.errors import BadMesh, FormatError, MissingExtra, NotABundle, NotACapture, counted
 from formats.safe_input import open_input
 
 HEAD = 1 << 14
 """Bytes of a file that are looked at."""
+TORCH = re.compile(rb"[^/\0]{1,200}/(data\.pkl|byteorder|version)")
+"""A name in the ZIP archives that PyTorch writes."""
 MAX_FILES = 2000
 """At most so many entries of a folder, and of the folders in it, are looked at."""
 HEIF = 'install the extra that reads it: pip install "fusedrf[heif]", or convert it to JPEG'
@@ -98,7 +100,7 @@ KINDS = {  # the first whose pattern fits counts
     ),
     "splats": Kind(
         "a scene of Gaussian splats",
-        "give the photos that it was made from",
+        "make a bundle of it with `fusedrf import`",
         "splat ksplat spz sog sogs",
         rb"ply[\r\n].*(property \S+ (f_dc_0|scale_0|packed_(position|scale))\b|element chunk.*element sh\b)",
     ),
@@ -157,7 +159,7 @@ KINDS = {  # the first whose pattern fits counts
     ),
     "checkpoint": Kind(
         "another program's checkpoint or arrays",
-        "give the photos that it was learnt from",
+        "make a bundle of it with `fusedrf import`, or give the photos that it was learnt from",
         "pth pt ckpt msgpack ingp npz npy pkl pickle h5 hdf5 safetensors onnx bin tensorf",
         rb"\x93NUMPY|\x89HDF|\x80[\x02-\x05]",
     ),
@@ -204,6 +206,16 @@ def not_a_capture(path: Path) -> FormatError:
         return _of_folder(path)
     other = _named(path)
     return other.error(f"{path}: is {other.what}, no capture")
+
+
+def not_a_bundle(path: Path, head: bytes) -> NotABundle | None:
+    """The error for a file of another sort, by its first bytes, where a bundle or a scene is expected; None
+    where they do not tell."""
+    checkpoint = head.startswith(b"PK") and TORCH.search(head)
+    other = _foreign("checkpoint") if checkpoint else identify(head, path.suffix)
+    if other is None or other.kind in ("bundle", "text", "other", "archive"):
+        return None
+    return NotABundle(f"{path}: is {other.what}, neither a bundle nor a scene; {other.cure}")
 
 
 def not_a_mesh(path: Path) -> BadMesh:

@@ -43,7 +43,8 @@ from formats.nodes import (
     within,
 )
 from formats.nodes import make_node as make_node
-from formats.safe_input import parse_json, read_input
+from formats.other_files import HEAD, not_a_bundle
+from formats.safe_input import open_input, parse_json, read_input
 
 FORMAT = "rfpack"
 VERSION = "1.5"
@@ -191,6 +192,10 @@ class SceneGraph:
 
 def read_scene(path: Path | str) -> SceneGraph:
     """The scene graph in a plain `scene.json`, whose nodes name sources only."""
+    with open_input(path) as file:
+        head = file.read(HEAD)
+    if not head.lstrip().startswith(b"{") and (other := not_a_bundle(Path(path), head)) is not None:
+        raise other
     scene = parse_scene(read_input(path, MAX_SCENE_BYTES), str(path))
     for node, _, _ in scene.walk():
         if node.field is not None:

@@ -3,9 +3,10 @@
 import numpy as np
 
 from formats.splats.reading import read_splats
-from formats.splats.splats import UP_Z
+from formats.splats.splats import UP_Z, Splats
 from fusedrf_cli.bridge.importing.parts import Imported, ImportedNode
 from fusedrf_cli.bridge.memory import Memory
+from fusedrf_cli.engine.kinds.splats.device_functions import REACH
 from fusedrf_cli.engine.kinds.splats.field import SplatsField
 from fusedrf_cli.errors import InvalidInput
 
@@ -13,8 +14,16 @@ PER_SPLAT = 1500
 """Bytes while a field is made of a splat, and written."""
 
 
+MOST_SHELLS = 4
+INNER = 0.99
+"""Share of the splats that a shell's box is put around."""
+WIDER = 2.5
+"""Times as wide as that box, up to which all splats are one field: cells for those far away, or as large as
+the surroundings, would be too coarse for the others."""
+
+
 def read(path: str, memory: Memory) -> tuple[Imported, tuple[float, ...] | None]:
-    """The field of a file, and which way is up in it where that is not +z. Raises FormatError."""
+    """The fields of a file, and which way is up in it where that is not +z. Raises FormatError."""
     splats = read_splats(path)
     if not len(splats):
         raise InvalidInput(f"{path}: holds no splats")
@@ -22,7 +31,42 @@ def read(path: str, memory: Memory) -> tuple[Imported, tuple[float, ...] | None]
         {f"{len(splats):,} splats": float(PER_SPLAT * len(splats))},
         advice="close other programs, or raise --memory",
     )
+    shells = shells_of(boxes_around(splats))
+    nodes = [
+        ImportedNode(field_of(splats, shell), suffix=f"-{i + 1}" if len(shells) > 1 else "")
+        for i, shell in enumerate(shells)
+    ]
+    notes = [f"a file of {splats.kind}", *splats.notes]
+    if len(shells) > 1:
+        counts = ", ".join(f"{len(shell):,}" for shell in shells)
+        notes.append(
+            f"it becomes {len(shells)} fields that add up, from the middle outwards: {counts} splats"
+        )
+    return Imported(nodes, notes, "add"), None if splats.up == UP_Z else splats.up
+
+
+def field_of(splats: Splats, index: np.ndarray) -> SplatsField:
+    """Some of the splats as a field."""
     numbers = splats.centres, splats.scales, splats.rotations, splats.opacities, splats.harmonics
-    field = SplatsField(*(np.ascontiguousarray(values, np.float32) for values in numbers))
-    up = None if splats.up == UP_Z else splats.up
-    return Imported([ImportedNode(field)], [f"a file of {splats.kind}", *splats.notes]), up
+    return SplatsField(*(np.ascontiguousarray(values[index], np.float32) for values in numbers))
+
+
+def boxes_around(splats: Splats) -> np.ndarray:
+    """(N, 6) about as far as each splat reaches."""
+    wide = REACH * splats.scales.max(1, keepdims=True)
+    return np.concatenate([splats.centres - wide, splats.centres + wide], 1).astype(np.float64)
+
+
+def shells_of(boxes: np.ndarray) -> list[np.ndarray]:
+    """The numbers of splats with boxes (N, 6), in shells: each takes those that lie in the box around nearly
+    all that are left, and the last one the rest."""
+    left, shells = np.arange(len(boxes)), []
+    while len(shells) < MOST_SHELLS - 1 and len(left):
+        own = boxes[left]
+        low, high = np.quantile(own[:, :3], (1 - INNER) / 2, 0), np.quantile(own[:, 3:], (1 + INNER) / 2, 0)
+        if (own[:, 3:].max(0) - own[:, :3].min(0)).max() <= WIDER * (high - low).max():
+            break
+        inside = ((own[:, :3] >= low) & (own[:, 3:] <= high)).all(1)
+        shells.append(left[inside])
+        left = left[~inside]
+    return [shell for shell in (*shells, left) if len(shell)]

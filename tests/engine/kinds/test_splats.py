@@ -57,6 +57,8 @@ def test_it_answers_as_its_reference(field):
     sigma, rgb = field.query(points, dirs)
     expected = field.reference(field.params, points, dirs)
     inside = torch.from_numpy(field.occupancy.contains(points.numpy()))
+    halves = [field.reference(field.params, points[i::2], dirs[i::2])[0] for i in (0, 1)]
+    torch.testing.assert_close(torch.stack(halves, 1).view(-1), expected[0])
     assert inside.double().mean() > 0.5 and (expected[0] > 0).double().mean() > 0.3
     np.testing.assert_allclose(sigma[inside], expected[0][inside], rtol=2e-3, atol=2e-3 * float(sigma.max()))
     dense = inside & (expected[0] > 0.1)

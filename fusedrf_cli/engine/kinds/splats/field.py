@@ -29,10 +29,9 @@ MOST_CELLS = 384
 """Along the longest side."""
 PER_SPLAT = 120
 """Cells that a splat may be in, on the mean: with more, cells are made larger."""
-NEAR_ALL = 0.995
-"""Share of the splats that the cells are made for: a capture has a few far away, some as large as all."""
 
-
+PAIRS = 1 << 22
+"""Points times splats of the reference at once."""
 ARRAYS = "centres", "scales", "rotations", "opacities", "harmonics"
 
 
@@ -145,8 +144,11 @@ class SplatsField(ComputedField):
     def reference(
         self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """See ComputedField: all splats for every point."""
+        """See ComputedField: all splats for every point, of which there may be few at once."""
         count = len(self.centres)
+        parts = zip(*(values.split(max(1, PAIRS // count)) for values in (points, dirs)), strict=True)
+        if len(points) > max(1, PAIRS // count):
+            return tuple(map(torch.cat, zip(*(self.reference(params, *part) for part in parts), strict=True)))
         rows = params[: count * ROW].view(count, ROW)
         colours = params[count * ROW : count * (ROW + 3 * self.coefficients)].view(
             count, self.coefficients, 3
@@ -272,19 +274,26 @@ def rows_of(field: SplatsField) -> np.ndarray:
     return params
 
 
+def boxes_of(field: SplatsField) -> np.ndarray:
+    """(N, 6) around each splat as far as it reaches; minima above maxima of one that is never drawn."""
+    wide = np.einsum("nka,nk->na", np.abs(field.axes), field.extents)
+    return np.concatenate([field.centres - wide, field.centres + wide], 1)
+
+
 def cells_for(field: SplatsField) -> OccupancyGrid:
-    """A grid around nearly all splats, whose cells are as fine as lets a splat be in PER_SPLAT of them on the
-    mean."""
-    wide = np.einsum("nka,nk->na", np.abs(field.axes), np.maximum(field.extents, 0))
-    lows, highs = field.centres - wide, field.centres + wide
-    margin = (1 - NEAR_ALL) / 2
-    box = np.concatenate([np.quantile(lows, margin, axis=0), np.quantile(highs, 1 - margin, axis=0)])
+    """A grid around all splats, whose cells are as fine as lets one be in PER_SPLAT of them on the mean."""
+    boxes = boxes_of(field)[field.radius > 0]
+    if not len(boxes):
+        boxes = np.concatenate([field.centres[:1], field.centres[:1] + field.scales[:1]], 1).astype(
+            np.float64
+        )
+    box = np.concatenate([boxes[:, :3].min(0), boxes[:, 3:].max(0)])
     sides = box[3:] - box[:3]
-    box[3:] += np.maximum(1e-3 * sides.max(), 1e-9) * (sides <= 0)
+    box[3:] += np.maximum(1e-3 * sides.max() - sides, 0)
     for longest in (MOST_CELLS, 256, 192, 128, 96, 64, 48, 32, 16, 8):
         counts = cell_counts(box, longest)
         cell = (box[3:] - box[:3]) / counts
-        spans = np.clip(np.minimum(highs, box[3:]) - np.maximum(lows, box[:3]), 0, None) / cell + 1
-        if spans.prod(1).sum() <= PER_SPLAT * len(field.centres):
+        spans = (boxes[:, 3:] - boxes[:, :3]) / cell + 1
+        if spans.prod(1).sum() <= PER_SPLAT * len(boxes):
             break
     return OccupancyGrid(box, np.zeros(counts, bool))

@@ -1,0 +1,67 @@
+"""Splat files by the whole command."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from formats.bundle import OpenBundle
+from fusedrf_cli import verbs
+from fusedrf_cli.bridge.importing.splats import shells_of
+from fusedrf_cli.errors import InvalidInput
+from fusedrf_cli.python import open_scene
+
+
+def splat_file(path: Path, centres: np.ndarray, scale: float = 0.05) -> Path:
+    """A .splat of opaque balls: 32 bytes each."""
+    kinds = [("at", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)]
+    rows = np.zeros(len(centres), kinds)
+    rows["at"], rows["scale"], rows["turn"] = centres, scale, (255, 128, 128, 128)
+    rows["rgba"] = (255, 128, 0, 255)
+    path.write_bytes(rows.tobytes())
+    return path
+
+
+def test_a_file_becomes_a_bundle_that_answers_and_knows_what_is_up(tmp_path):
+    centres = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    file, bundle = splat_file(tmp_path / "balls.splat", centres), tmp_path / "balls.rfpack"
+    report = verbs.import_field(file, bundle)
+    assert report["fields"] == [{"name": "balls", "kind": "splats", "splats": 50, "sh_degree": 0}]
+    graph = OpenBundle(bundle).scene
+    assert graph.up == (0.0, -1.0, 0.0)
+    scene = open_scene(bundle)
+    sigma, rgb = scene.query(torch.from_numpy(centres[:5]), torch.tensor([[0.0, 0, 1]] * 5))
+    assert (sigma.detach() > 1).all()
+    np.testing.assert_allclose(rgb.detach(), np.tile([1, 128 / 255, 0], (5, 1)), atol=1e-2)
+    verbs.import_field(file, bundle, overwrite=True, up=(0, 0, 2))
+    assert OpenBundle(bundle).scene.up == (0.0, 0.0, 1.0)
+    verbs.rename(bundle, "balls", "marbles", tmp_path / "renamed.rfpack")
+    assert OpenBundle(tmp_path / "renamed.rfpack").scene.up == (0.0, 0.0, 1.0)
+
+
+def test_what_lies_far_away_becomes_a_field_of_its_own(tmp_path):
+    rng = np.random.default_rng(1)
+    centres = np.concatenate([rng.uniform(-1, 1, (400, 3)), rng.uniform(-300, 300, (3, 3))])
+    report = verbs.import_field(splat_file(tmp_path / "room.splat", centres), tmp_path / "room.rfpack")
+    assert sum(field["splats"] for field in report["fields"]) == 403 and len(report["fields"]) > 1
+    assert any("fields that add up" in note for note in report["notes"])
+    (group,) = OpenBundle(tmp_path / "room.rfpack").scene.nodes
+    assert group.name == "room" and group.composition == "add"
+    points = torch.from_numpy(centres[[0, -1]])
+    sigma, _ = open_scene(tmp_path / "room.rfpack").query(points, torch.tensor([[0.0, 0, 1]] * 2))
+    assert (sigma.detach() > 1).all()
+
+
+def test_shells_hold_every_splat_once():
+    rng = np.random.default_rng(2)
+    middles = rng.normal(size=(3000, 3)) * np.exp(rng.normal(0, 2, (3000, 1)))
+    shells = shells_of(np.concatenate([middles - 0.01, middles + 0.01], 1))
+    assert len(shells) > 1 and sorted(np.concatenate(shells)) == list(range(3000))
+
+
+def test_a_file_without_splats_is_refused(tmp_path):
+    (tmp_path / "notes.txt").write_text("no splats")
+    with pytest.raises(Exception, match="notes.txt") as caught:
+        verbs.import_field(tmp_path / "notes.txt", tmp_path / "out.rfpack")
+    assert caught.value.exit_code == InvalidInput.exit_code and not (tmp_path / "out.rfpack").exists()
