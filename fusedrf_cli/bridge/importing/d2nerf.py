@@ -254,7 +254,7 @@ def colours_of(network: Entries, name: str, outputs: int, features: int, code: n
         raise FormatError(f"{place.where}'hidden_0' should read {features} numbers and more")
     count, identity = frequencies_of(seen)
     bias = (0 if bias is None else bias) + weight[:, features + seen :].astype(np.float64) @ code
-    order = ColourInput(1 + features, outputs, count)
+    order = ColourInput(1 + features, outputs, count, alone=True)
     directions = [order.at("direction")] if identity else []
     columns = [order.at("features")[1:], *directions, order.waves("direction", count, by_level=True)]
     layers = [(weight[:, : features + seen], bias), *others]

@@ -169,8 +169,8 @@ def where(state: Entries):
             raise FormatError(f"'{FIELD}aabb' should be two corners of a box, found {corners.tolist()}")
         box = np.concatenate([corners.min(0), corners.max(0)])
         return box, corners[0] > corners[1], np.eye(4), bounded, 1.0
-    scale = np.broadcast_to(state.array(name + "scale").astype(np.float64).reshape(-1), 3)
-    moved = np.broadcast_to(state.array(name + "translation").astype(np.float64).reshape(-1), 3)
+    scale = state.array(name + "scale", 3).astype(np.float64)
+    moved = state.array(name + "translation", 3).astype(np.float64)
     if not (scale > 0).all() or scale.max() > 100 * scale.min():
         raise FormatError(f"'{name}scale' should be three numbers above 0, found {scale.tolist()}")
     mean = float(np.prod(scale) ** (1 / 3))
@@ -215,7 +215,10 @@ def codes_of(state: Entries, notes: list[str]) -> np.ndarray | None:
     if name not in state.values:
         return None
     notes.append("its appearance codes are fixed to their mean")
-    return state.array(name, None, None).astype(np.float64).mean(0)
+    codes = state.array(name, None, None).astype(np.float64)
+    if not codes.size:
+        raise FormatError(f"'{name}' should hold codes, found none")
+    return codes.mean(0)
 
 
 def hybrid_decoders(state, sigma_net, columns, width, codes, rest):

@@ -11,6 +11,8 @@ sigmoid(logit) (1 - sigmoid(feature f)) (the shadows of D²NeRF, Wu et al., Neur
 
 The inputs lie in blocks as wide as x, where others interleave frequencies, and encode features and direction
 by as many as they like: an importer permutes the columns of the first layer, and leaves 0 what is not there.
+Where only the direction is encoded D(d) is `waves`, [d, sin d, sin 2d, .., cos d, cos 2d, ..], made once for
+a ray, and x itself is the input.
 """
 
 import math
@@ -35,7 +37,7 @@ class Options(msgspec.Struct, forbid_unknown_fields=True):
     layers: Layers = 2
     rows: Annotated[int, msgspec.Meta(ge=0, le=256)] = 0
     frequencies: Frequencies = 2
-    direction: Literal["raw", "harmonics"] = "raw"
+    direction: Literal["raw", "harmonics", "waves"] = "raw"
     point: bool = False
     diffuse: bool = False
     limits: tuple[float, float] | None = None
@@ -52,8 +54,14 @@ class Arrays(NamedTuple):
 
 
 def core_of(width: int, rows: int, direction: str, point: bool) -> int:
-    """Numbers of x."""
+    """Numbers of x, but for the sines and cosines of `waves`."""
     return (rows or width) + (HARMONICS if direction == "harmonics" else 3) + 3 * point
+
+
+def inputs_of(width: int, rows: int, frequencies: int, direction: str, point: bool) -> int:
+    """Numbers that the first layer reads."""
+    core = core_of(width, rows, direction, point)
+    return core + 6 * frequencies if direction == "waves" else (1 + 2 * frequencies) * core
 
 
 def layer_shapes(
@@ -62,7 +70,7 @@ def layer_shapes(
 ) -> list[tuple[int, int]]:  # fmt: skip
     """(inputs, outputs) of each layer in memory: outputs are filled up to runs of eight with zeros."""
     wide = -(-hidden // 8) * 8
-    inputs = (1 + 2 * frequencies) * core_of(width, rows, direction, point)
+    inputs = inputs_of(width, rows, frequencies, direction, point)
     return [(inputs, wide), *[(wide, wide)] * (layers - 1), (wide, OUTPUTS)]
 
 
@@ -74,15 +82,19 @@ def sizes(
     the input, of x and of the features. Features, input and the layers' outputs are kept."""
     shapes = layer_shapes(width, rows, hidden, layers, frequencies, direction, point)
     (inputs, wide), core = shapes[0], core_of(width, rows, direction, point)
+    waves = frequencies if direction == "waves" else 0
+    if direction == "waves":
+        core, frequencies = inputs, 0
     rooms = {
-        "DIRECTION": HARMONICS, "POINT": 8, "D_LAST": OUTPUTS, "D_HIDDEN": wide, "D_BEFORE": wide,
-        "D_INPUT": inputs, "D_X": core, "D_ROWS": width,
+        "DIRECTION": max(HARMONICS, 3 + 6 * waves), "POINT": 8, "D_LAST": OUTPUTS, "D_HIDDEN": wide,
+        "D_BEFORE": wide, "D_INPUT": inputs, "D_X": core, "D_ROWS": width,
     }  # fmt: skip
     starts = np.cumsum([0, *rooms.values()]).tolist()
     offsets = np.cumsum([width, inputs, layers * wide, OUTPUTS]).tolist()
     return {
         "WIDTH": width, "BASIS": int(rows > 0), "ROWS": rows or width, "INPUTS": inputs, "HIDDEN": wide,
-        "LAYERS": layers, "FREQUENCIES": frequencies, "CORE": core, "AS_HARMONICS": int(direction != "raw"),
+        "LAYERS": layers, "FREQUENCIES": frequencies, "CORE": core,
+        "AS_HARMONICS": int(direction == "harmonics"), "WAVES": waves,
         "DIRECTIONS": core - (rows or width) - 3 * point, "POINTS": 3 * point, "DIFFUSE": int(diffuse),
         "DIMMED": dimmed,
         "LIMITED": int(limits is not None), "LOWEST": float((limits or (0, 0))[0]),
@@ -116,9 +128,10 @@ def reference(
     read = features @ sections["basis"].T if rows else features
     read = read if limits is None else read.clamp(*limits)
     seen = torch_reference.sh_basis(HARMONICS, dirs) if direction == "harmonics" else dirs
+    if direction == "waves":
+        seen, frequencies = encoded(dirs, frequencies), 0
     x = torch.cat([read, seen.to(read.dtype), *([2 * unit - 1] if point else [])], 1)
-    waves = [wave(2.0**level * x) for wave in (torch.sin, torch.cos) for level in range(frequencies)]
-    x = torch.cat([x, *waves], 1)
+    x = encoded(x, frequencies)
     for i in range(layers + 1):
         x = x @ sections[f"layer_{i}"][:-1] + sections[f"layer_{i}"][-1]
         x = x.relu() if i < layers else x[:, :3]
@@ -129,6 +142,12 @@ def reference(
 def dimmed_by(logits: torch.Tensor, shadow: torch.Tensor) -> torch.Tensor:
     """The logit of sigmoid(logits) (1 - sigmoid(shadow)), as `dimmed_logit`."""
     return -torch.logsumexp(torch.stack(torch.broadcast_tensors(-logits, shadow, shadow - logits)), 0)
+
+
+def encoded(x: torch.Tensor, frequencies: int) -> torch.Tensor:
+    """[x, sin x, sin 2x, .., cos x, cos 2x, ..]."""
+    waves = [wave(2.0**level * x) for wave in (torch.sin, torch.cos) for level in range(frequencies)]
+    return torch.cat([x, *waves], 1)
 
 
 def bound(
@@ -149,11 +168,17 @@ def bound(
 
 
 def ray_setup(field, d, scratch):
-    """The direction, or its harmonics."""
+    """The direction, perhaps with its sines and cosines, or its harmonics."""
     if AS_HARMONICS:
         sh_basis(HARMONICS, d, scratch, AT + DIRECTION)
     else:
         scratch[AT + DIRECTION], scratch[AT + DIRECTION + 1], scratch[AT + DIRECTION + 2] = d
+        for level in range(WAVES):
+            at = AT + DIRECTION + 3 + 3 * level
+            for axis in range(3):
+                angle = scratch[AT + DIRECTION + axis] * (1 << level)
+                scratch[at + axis] = math.sin(angle)
+                scratch[at + 3 * WAVES + axis] = math.cos(angle)
 
 
 def point_setup(field, unit, scratch):

@@ -22,7 +22,6 @@ from fusedrf_cli.engine.fields.box import ParameterBlock
 from fusedrf_cli.engine.fields.part_options import Frequencies, Layers, Width
 from fusedrf_cli.engine.kernels.networks import network, network_backward
 
-FARTHEST = 1e4  # from 0, of a box
 TWIST = 8
 """Outputs of the warp: w, v and two unused."""
 
@@ -162,19 +161,19 @@ def reference(
     return torch.nn.functional.pad(made, (0, -made.shape[1] % 8))
 
 
-def bound(
-    sections: dict, read: None, count: int, warp: dict, sheet: dict, coordinates: int,
+def bound_within(
+    reach: float, sections: dict, count: int, warp: dict, sheet: dict, coordinates: int,
     coordinate_count: int = 1, still: bool = False,
 ) -> torch.Tensor:  # fmt: skip
     """See encodings; a twist moves no point farther than by its v, but for turning it around 0."""
     largest = {name: view.abs().double() for name, view in sections.items()}
     e = torch.ones(1, 3 + 6 * warp["count"], dtype=torch.float64)
-    e[:, :3] = FARTHEST
+    e[:, :3] = reach
     speed = evaluated("warp", largest, e, **warp)[0, 3:6].norm()
     features = torch.ones(sizes(count, warp, sheet, coordinates, coordinate_count, still)["WIDTH"]).double()
-    features[:3] = FARTHEST
+    features[:3] = reach
     start = (3 + 6 * count) * still
-    features[start : start + 3] = 3**0.5 * FARTHEST + speed
+    features[start : start + 3] = 3**0.5 * reach + speed
     return features
 
 

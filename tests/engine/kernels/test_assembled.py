@@ -105,12 +105,15 @@ COLOURS = {
         mlp,
         {"width": width, "rows": 0, "hidden": 8, "frequencies": 0, "direction": "harmonics"},
     ),
+    "mlp_of_waves": lambda width: (
+        mlp,
+        {"width": width, "rows": 0, "hidden": 8, "frequencies": 4, "direction": "waves", "point": True},
+    ),
     "mlp_of_points": lambda width: (
         mlp,
         {"width": width, "rows": 4, "hidden": 8, "layers": 1, "point": True, "limits": (-0.5, 0.5)},
     ),
 }
-FRAMED = "frame_frequencies", "warped_frequencies", "still_too"
 
 
 @dataclass(frozen=True)
@@ -217,6 +220,8 @@ def test_compiled_products_answer_and_send_back_as_their_references(number):
 
 
 def test_references_are_differentiable_in_numbers_points_and_directions(field):
+    if field.shape.sigma == "limited":
+        pytest.skip("beyond its limits a gradient goes on where the function does not")
     points, dirs = (torch.from_numpy(values).requires_grad_() for values in samples(field, 8))
     leaves = field.params.clone().requires_grad_(), points, dirs
     assert torch.autograd.gradcheck(field.reference, leaves, fast_mode=True, eps=1e-7, atol=1e-6, rtol=1e-5)
@@ -232,7 +237,8 @@ def test_no_answer_is_beyond_the_bound(field):
     field.check_answers()
     points, dirs = (torch.from_numpy(values) for values in samples(field, 500))
     sigma, rgb = field.reference(field.params, points, dirs)
-    far = 1e5 if field.shape.density in FRAMED else 1  # no box is known to the bound
+    deep = field.shape.sigma == "deep_trunk" or field.shape.density == "still_too"
+    far = 100 if deep else 1  # bounds multiply from layer to layer
     if field.slots["sigma"].sizes["ACTIVATION"] == 0:
         raw = torch.expm1(sigma / field.scale).log() - field.shift
         assert raw.abs().max() <= bounds["density"] < 1e4 * far

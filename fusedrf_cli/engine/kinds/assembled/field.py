@@ -48,8 +48,6 @@ PARTS: dict[str, tuple[ModuleType, ...]] = {
     "rgb": (rgb, sh, sh_basis, direction_basis, direction_texture, mlp),
 }
 """What may fill each slot, by the names of their modules."""
-FARTHEST = warped_frequencies.FARTHEST
-"""From 0, of a box whose points are encoded as they are: `bound` of those encodings counts on it."""
 
 
 def name_of(module: ModuleType) -> str:
@@ -145,10 +143,6 @@ class PartsField(AssembledField):
 
     def check_answers(self) -> None:
         """See BoxField."""
-        encodings = [slot for slot in self.slots.values() if slot.module in ENCODINGS]
-        framed = [s.options.get("frame", s.module is warped_frequencies) for s in encodings]
-        if any(framed) and np.abs(self.box).max() > FARTHEST:
-            raise ValueError(f"the box of points that are encoded should lie within {FARTHEST:g} of 0")
         sigma = self.slots["sigma"].sizes
         if sigma["ACTIVATION"] == 1 and self.scale * np.exp(sigma["HIGHEST"]) > MAX_ANSWER:
             raise ValueError(f"the density would reach {self.scale:g} exp({sigma['HIGHEST']:g})")
