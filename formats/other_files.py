@@ -23,6 +23,7 @@ CAD = "export a mesh (.glb or .stl) of it"
 PNG = "save it as PNG of 8 or 16 bits in sRGB"
 COLMAP = "export COLMAP or convert it with nerfstudio's `ns-process-data {}`, and give the folder"
 MESHES = "give a .glb, .gltf, .obj, .ply, .stl or .off with faces"
+TRAIN = "learn a field of it with `fusedrf train`; of splats `fusedrf import` makes a bundle"
 GIVE = "give a capture's folder, its transforms.json, or a mesh"
 
 
@@ -215,7 +216,8 @@ def not_a_bundle(path: Path, head: bytes) -> NotABundle | None:
     other = _foreign("checkpoint") if checkpoint else identify(head, path.suffix)
     if other is None or other.kind in ("bundle", "text", "other", "archive"):
         return None
-    return NotABundle(f"{path}: is {other.what}, neither a bundle nor a scene; {other.cure}")
+    cure = TRAIN if other.kind == "mesh" else other.cure
+    return NotABundle(f"{path}: is {other.what}, neither a bundle nor a scene; {cure}")
 
 
 def not_a_mesh(path: Path) -> BadMesh:

@@ -241,11 +241,17 @@ SYSTEMS = {  # the first whose rule fits counts
     "torch-ngp": System(  # but for its networks of moving scenes
         "torch-ngp",
         "model/encoder.embeddings:* model/encoder.offsets:* model/sigma_net.0.weight:* "
-        "!model/deform_net.* !model/basis_net.* !model/ambient_net.*",
+        "!model/deform_net.* !model/basis_net.* !model/ambient_net.*"
+        "| model/encoder.embeddings:* model/sigma_net.weights:* model/color_net.weights:*"
+        "| model/encoder.params:* model/sigma_net.params:* model/color_net.params:*"
+        "| model/sigma_vec.0:* model/color_vec.0:* model/basis_mat.weight:* model/color_net.0.weight:*",
     ),
     "nerfacto": System(
         "nerfstudio's nerfacto",
-        "pipeline/_model.field.mlp_base* pipeline/_model.field.mlp_head* pipeline/_model.proposal_networks.*",
+        "pipeline/*_model.*field.mlp_base* pipeline/*_model.*field.mlp_head* "
+        "pipeline/*_model.*proposal_networks.*"
+        "| pipeline/*_model.*field.mlp_base* pipeline/*_model.*field.mlp_head* "
+        "pipeline/*_model.*occupancy_grid.*",
         ("config.yml", "dataparser_transforms.json"),
     ),
     "k-planes": System("K-Planes", "model/field.grids.0.0:* model/field.sigma_net.params:*", ("config.py",)),

@@ -148,16 +148,18 @@ def box_of(request: ImportRequest, capture: Capture | None, checkpoint: Checkpoi
 def write(
     imported: Imported, request: ImportRequest, capture: Capture | None, up: tuple[float, ...] | None
 ) -> SceneGraph:
-    """Write the bundle; its scene graph. up: which way is up in its world, where that is known."""
+    """Write the bundle; its scene graph: several nodes stand in a group. up: which way is up in its world,
+    where that is known."""
     writer, nodes, names = BundleWriter(), [], set()
     wanted = request.name or Path(request.path).stem
+    group = free_name(wanted, names) if len(imported.nodes) > 1 else None
     for node in imported.nodes:
         member = writer.add_field(FieldRecord(node.field.kind, *node.field.state()), request.precision)
         name = free_name(wanted + node.suffix, names)
         nodes.append(make_node(name, field=member, **placement_of(node.object_to_world)))
-    if imported.rule != "max" and len(nodes) > 1:
-        group = make_node(free_name(wanted, names), children=tuple(nodes))
-        nodes = [replace(group, composition=imported.rule)]
+    if group is not None:
+        rule = None if imported.rule == "max" else imported.rule
+        nodes = [replace(make_node(group, children=tuple(nodes)), composition=rule)]
     cameras = None
     if capture is not None:
         unbounded = any(node.field.space is not bounded for node in imported.nodes)

@@ -2,6 +2,7 @@
 torch or by tiny-cuda-nn."""
 
 from collections.abc import Mapping
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -26,47 +27,76 @@ from fusedrf_cli.engine.kinds.assembled.field import PartsShape
 from fusedrf_cli.engine.spaces import bounded, contracted_linf
 
 FIELD = "_model.field."
-HARMONICS, HIDDEN = 16, 64
+HARMONICS = 16
+USUAL = {"base_res": 16, "features_per_level": 2, "hidden_dim": 64, "hidden_dim_color": 64}
+SIZES = {"max_res": 2048, "num_levels": 16, "log2_hashmap_size": 19}
+"""What a model of before these were stored in the file has, unless its settings say so."""
+DEPTHS = 1, 2, 3, 4, 5, 6, 0  # hidden layers that networks may have beside the usual
 MOST_SAMPLES = 512  # vertices along an axis by which rays are sampled
 DENSITY = 0.01  # average_init_density of the recipe
+OWN_ARRAYS = "mlp_base.params", "mlp_base.model.params", "mlp_base_mlp.tcnn_encoding.params"
+"""Names of the network of density where tiny-cuda-nn computes it: of 2022, now, and of 2023."""
 
 
 def read(checkpoint) -> Imported:
     """The field of a checkpoint. Raises FormatError."""
-    state = Entries(checkpoint.entries).inside("pipeline")
-    settings = model_settings(checkpoint.beside.get("config.yml"))
-    finest = state.whole(FIELD + "max_res", 2, 1 << 20)
-    count = state.whole(FIELD + "num_levels", 1, 32)
-    log2_rows = state.whole(FIELD + "log2_hashmap_size", 1, 26)
-    base = int(settings.get("base_res", 16))
-    if FIELD + "mlp_base.model.params" in state.values:
-        levels, features, rows, trunk = tcnn_base(state, settings, finest, count, log2_rows, base)
-        codes, head = codes_of(state, settings), None
-        head = tcnn_head(state, settings, len(trunk[-1][0]), codes)
+    pipeline = Entries(checkpoint.entries).inside("pipeline")
+    state, marched = (
+        state_of(pipeline),
+        any("_model.occupancy_grid." in str(name) for name in pipeline.values),
+    )
+    settings = Entries(model_settings(checkpoint.beside.get("config.yml")), "config.yml: ")
+    finest, count, log2_rows = (
+        int((state if name in state.values else settings).number(name, default))
+        for name, default in SIZES.items()
+    )
+    base = settings.whole("base_res", 1, 1 << 16, USUAL["base_res"])
+    if not (1 <= count <= 32 and 1 <= log2_rows <= 26 and base <= finest <= 1 << 20):
+        raise FormatError(
+            f"a grid of {count} levels of {base} to {finest} vertices and 2^{log2_rows} rows is not read"
+        )
+    codes = codes_of(state, settings)
+    known = 0 if codes is None else len(codes)
+    if any(name in state.values for name in OWN_ARRAYS):
+        levels, rows, trunk = tcnn_base(state, settings, finest, count, log2_rows, base)
+        head, outputs = tcnn_head(state, settings, len(trunk[-1][0]), known)
+        trunk[-1] = trunk[-1][0][:outputs], None if trunk[-1][1] is None else trunk[-1][1][:outputs]
     else:
-        levels, features, rows, trunk = torch_base(state, finest, count, log2_rows, base)
-        codes = codes_of(state, settings)
-        head = torch_head(state, len(trunk[-1][0]), codes)
-    sigma, sections = trunk_layers(trunk, eight(count * features))
+        levels, rows, trunk = torch_base(state, finest, count, log2_rows, base)
+        outputs, head = len(trunk[-1][0]), torch_head(state)
+    head = folded(head, codes, HARMONICS + outputs - 1)
+    sigma, sections = trunk_layers(trunk, eight(count * rows.shape[1]))
     order = ColourInput(sigma["outputs"], sigma["outputs"], harmonics=True)
-    columns = np.concatenate([order.at("direction"), order.at("features")[1 : len(trunk[-1][0])]])
+    columns = np.concatenate([order.at("direction"), order.at("features")[1:outputs]])
     rgb, more = colour_network(head, order, columns)
-    encoding = {"part": "hash_grid", "features": features, "levels": levels}
+    encoding = {"part": "hash_grid", "features": rows.shape[1], "levels": levels}
     shape = PartsShape(encoding, {"part": "trunk_features"}, sigma, rgb)
-    contracted = not settings.get("disable_scene_contraction", False)
+    contracted = not settings.values.get("disable_scene_contraction", False)
     box = np.array([-2.0] * 3 + [2.0] * 3) if contracted else own_box(state)
     cells = OccupancyGrid.full(box, space=contracted_linf if contracted else bounded)
     resolution = (min(finest, MOST_SAMPLES) + 1,) * 3
-    scale = float(settings.get("average_init_density", DENSITY))
+    scale, notes = density_of(state, settings, marched)
+    if marched:  # nerfstudio's instant-ngp, whose field this is as well
+        notes.append(
+            "the grid of cells that its pictures are sampled in is left out: it is sampled everywhere"
+        )
     field = parts_field(
         shape, box, resolution, {"density_rows": rows} | sections | more, scale, occupancy=cells
     )
-    placement, notes = placement_of(checkpoint.beside.get("dataparser_transforms.json"))
-    if not settings:
-        notes.append(f"no config.yml lies beside it: densities are taken to begin at {DENSITY:g}")
+    placement, said = placement_of(checkpoint.beside.get("dataparser_transforms.json"))
     if codes is not None:
-        notes.append("its appearance codes are fixed to their mean")
-    return Imported([ImportedNode(field, placement)], notes)
+        said.append(f"its appearance codes are fixed to {'their mean' if codes.any() else '0'}")
+    return Imported([ImportedNode(field, placement)], notes + said)
+
+
+def state_of(pipeline: Entries) -> Entries:
+    """The field's entries. Runs on several GPUs have "module." in front of a name, or within."""
+    found = {}
+    for name, value in pipeline.values.items():
+        plain = str(name).removeprefix("module.").replace("_model.module.", "_model.", 1)
+        if plain.startswith(FIELD):
+            found[plain.removeprefix(FIELD)] = value
+    return Entries(found, FIELD)
 
 
 def model_settings(config: Any) -> Mapping[str, Any]:
@@ -76,21 +106,39 @@ def model_settings(config: Any) -> Mapping[str, Any]:
     return config if isinstance(config, Mapping) else {}
 
 
+def density_of(state: Entries, settings: Entries, marched: bool) -> tuple[float, list[str]]:
+    """What densities are multiplied by, and notes. It is 1 where settings do not know it, as of versions
+    before that setting, and of models that have none."""
+    if settings.values:
+        scale = settings.number("average_init_density", 1.0)
+        if not scale > 0:
+            raise FormatError(f"config.yml: 'average_init_density' should be above 0, found {scale:g}")
+        return scale, []
+    before = marched or not {"mlp_base.model.params", "mlp_base.model.0.hash_table"} & set(state.values)
+    scale = 1.0 if before else DENSITY
+    return scale, [
+        "no config.yml lies beside it: its recipe's settings are assumed, densities that begin at "
+        f"{scale:g}, contracted space, the mean of appearance codes"
+    ]
+
+
 def own_box(state: Entries) -> np.ndarray:
     """The box (6,) of a scene that is not contracted."""
-    box = state.array(FIELD + "aabb", 2, 3).astype(np.float64).reshape(6)
+    box = state.array("aabb", 2, 3).astype(np.float64).reshape(6)
     if not (box[:3] < box[3:]).all():
         raise FormatError(f"'{FIELD}aabb' should be three minima below three maxima, found {box.tolist()}")
     return box
 
 
-def codes_of(state: Entries, settings: Mapping[str, Any]) -> np.ndarray | None:
-    """The code of pictures that is shown: the mean of those that were learnt."""
-    name = FIELD + "embedding_appearance.embedding.weight"
+def codes_of(state: Entries, settings: Entries) -> np.ndarray | None:
+    """The code of pictures that is shown: the mean of those that were learnt, or 0."""
+    name = "embedding_appearance.embedding.weight"
     if name not in state.values:
         return None
     codes = state.array(name, None, None).astype(np.float64)
-    return codes.mean(0) if settings.get("use_average_appearance_embedding", True) else 0 * codes[0]
+    if not codes.size:
+        return None
+    return codes.mean(0) if settings.values.get("use_average_appearance_embedding", True) else 0 * codes[0]
 
 
 def folded(head: list[Layer], codes: np.ndarray | None, read: int) -> list[Layer]:
@@ -107,8 +155,12 @@ def folded(head: list[Layer], codes: np.ndarray | None, read: int) -> list[Layer
 
 
 def torch_base(state: Entries, finest: int, count: int, log2_rows: int, base: int):
-    """The levels of the hash grid, numbers of a row, rows, and the trunk's layers."""
-    rows = state.array(FIELD + "mlp_base.model.0.hash_table", count << log2_rows, None)
+    """The levels of the hash grid, its rows, and the trunk's layers."""
+    now = "mlp_base.model.0.hash_table" in state.values
+    table, network = (
+        ("mlp_base.model.0.", "mlp_base.model.1.") if now else ("mlp_base_grid.", "mlp_base_mlp.")
+    )
+    rows = state.array(table + "hash_table", count << log2_rows, None)
     growth = np.exp((np.log(finest) - np.log(base)) / (count - 1)) if count > 1 else 1.0
     # in float32, as there: the finest level of 16 to 2048 has 2047
     scales = torch.floor(base * growth ** torch.arange(count)).tolist()
@@ -116,13 +168,12 @@ def torch_base(state: Entries, finest: int, count: int, log2_rows: int, base: in
         {"scale": scale, "side": int(scale) + 1, "rows": 1 << log2_rows, "hashed": True, "offset": 0.0}
         for scale in scales
     ]
-    return levels, rows.shape[1], rows, state.layers(FIELD + "mlp_base.model.1.layers.")
+    return levels, rows, state.layers(network + "layers.")
 
 
-def torch_head(state: Entries, outputs: int, codes: np.ndarray | None) -> list[Layer]:
+def torch_head(state: Entries) -> list[Layer]:
     """The colour network, which reads harmonics of its own kind."""
-    head = folded(state.layers(FIELD + "mlp_head.layers."), codes, HARMONICS + outputs - 1)
-    (weight, bias), *others = head
+    (weight, bias), *others = state.layers("mlp_head.layers.")
     weight = weight.astype(np.float64)
     weight[:, :HARMONICS] = weight[:, :HARMONICS] @ harmonics_as_there()
     return [(weight, bias), *others]
@@ -151,42 +202,47 @@ def harmonics_as_there() -> np.ndarray:
 # -- computed by tiny-cuda-nn --------------------------------------------------------------------------------
 
 
-def tcnn_base(
-    state: Entries, settings: Mapping[str, Any], finest: int, count: int, log2_rows: int, base: int
-):
-    """See torch_base. Numbers are halves where they are computed with."""
-    params = halves(state, FIELD + "mlp_base.model.params")
+def tcnn_base(state: Entries, settings: Entries, finest: int, count: int, log2_rows: int, base: int):
+    """See torch_base. Numbers are halves where they are computed with. The outputs are what they are filled
+    up to."""
     growth = np.exp((np.log(finest) - np.log(base)) / (count - 1)) if count > 1 else 1.0
-    levels = tcnn.levels_of(count, log2_rows, base, np.log2(np.float32(growth)))
+    levels = tcnn.levels_of(count, log2_rows, base, tcnn.single(np.log2, np.float32(growth)))
     rows = sum(level["rows"] for level in levels)
-    features = int(settings.get("features_per_level", 2))
-    neurons, hidden = int(settings.get("hidden_dim", HIDDEN)), int(settings.get("num_layers", 2)) - 1
-    outputs = 16
-    shapes = tcnn.shapes_of(count * features, neurons, hidden, outputs, by_of(neurons))
-    if tcnn.size_of(shapes) + rows * features != len(params):
-        raise FormatError(
-            f"'{FIELD}mlp_base.model.params' has {len(params):,} numbers, which its sizes do not"
-        )
-    layers, params = tcnn.network_of(params, shapes, count * features, outputs, 0.0)
-    return levels, features, tcnn.rows_of(params, levels, features), layers
-
-
-def tcnn_head(
-    state: Entries, settings: Mapping[str, Any], outputs: int, codes: np.ndarray | None
-) -> list[Layer]:
-    """See torch_head; its harmonics are the orthonormal ones."""
-    name = FIELD + "mlp_head.tcnn_encoding.params"
+    name = next(name for name in OWN_ARRAYS if name in state.values)
     params = halves(state, name)
-    neurons, hidden = (
-        int(settings.get("hidden_dim_color", HIDDEN)),
-        int(settings.get("num_layers_color", 3)) - 1,
-    )
-    read = HARMONICS + outputs - 1 + (0 if codes is None else len(codes))
-    shapes = tcnn.shapes_of(read, neurons, hidden, 3, by_of(neurons))
-    if tcnn.size_of(shapes) != len(params):
-        raise FormatError(f"'{name}' has {len(params):,} numbers, which its sizes do not")
-    layers, _ = tcnn.network_of(params, shapes, read, 3, 1.0)
-    return folded(layers, codes, HARMONICS + outputs - 1)
+    apart = name == OWN_ARRAYS[2]
+    table = halves(state, "mlp_base_grid.tcnn_encoding.params") if apart else None
+    found = settings.whole("features_per_level", 1, 8, USUAL["features_per_level"])
+    for features, outputs, neurons, hidden in product(
+        dict.fromkeys((found, 1, 2, 4, 8)), (16, 32, 48, 64), widths(settings, "hidden_dim"), (1, *DEPTHS)
+    ):
+        shapes = tcnn.shapes_of(count * features, neurons, hidden, outputs, by_of(neurons))
+        if tcnn.size_of(shapes) + (0 if apart else rows * features) == len(params) and (
+            table is None or len(table) == rows * features
+        ):
+            layers, rest = tcnn.network_of(params, shapes, count * features, outputs, 1.0 if apart else 0.0)
+            return levels, tcnn.rows_of(rest if table is None else table, levels, features), layers
+    raise FormatError(f"'{FIELD}{name}' has {len(params):,} numbers, which no network over its grid has")
+
+
+def tcnn_head(state: Entries, settings: Entries, most: int, codes: int) -> tuple[list[Layer], int]:
+    """The colour network, whose harmonics are the orthonormal ones, and how many outputs of the trunk's there
+    are: as many as it reads, of at most `most`."""
+    name = "mlp_head.params" if "mlp_head.params" in state.values else "mlp_head.tcnn_encoding.params"
+    params = halves(state, name)
+    for outputs, neurons, hidden in product(
+        range(most, 1, -1), widths(settings, "hidden_dim_color"), (2, *DEPTHS)
+    ):
+        read = HARMONICS + outputs - 1 + codes
+        shapes = tcnn.shapes_of(read, neurons, hidden, 3, by_of(neurons))
+        if tcnn.size_of(shapes) == len(params):
+            return tcnn.network_of(params, shapes, read, 3, 1.0)[0], outputs
+    raise FormatError(f"'{FIELD}{name}' has {len(params):,} numbers, which no network over its features has")
+
+
+def widths(settings: Entries, name: str) -> dict[int, None]:
+    """How wide a network may be: as its settings say, or one of those that recipes have."""
+    return dict.fromkeys((settings.whole(name, 1, 1024, USUAL[name]), 64, 128, 256, 32, 16))
 
 
 def by_of(neurons: int) -> int:

@@ -63,10 +63,19 @@ class Entries:
             raise FormatError(f"{self.where}'{name}' is missing")
         return self.values[name]
 
+    def values_of(self, name: str) -> np.ndarray:
+        """An entry as an array of any type; of lists that differ in length it is no numbers."""
+        value = self.get(name)
+        if hasattr(value, "array"):
+            return value.array()
+        try:
+            return np.asarray(value)
+        except ValueError:
+            return np.asarray(None)
+
     def array(self, name: str, *shape: int | None) -> np.ndarray:
         """An array as float32, or float64 where it is that; of a shape, None for any size."""
-        value = self.get(name)
-        value = value.array() if hasattr(value, "array") else np.asarray(value)
+        value = self.values_of(name)
         if value.dtype.kind not in "fiub":
             raise FormatError(f"{self.where}'{name}' should hold numbers")
         found, fits = value.shape, not shape or len(shape) == value.ndim
@@ -82,8 +91,7 @@ class Entries:
         """A number."""
         if default is not None and name not in self.values:
             return default
-        value = self.get(name)
-        value = value.array().reshape(-1) if hasattr(value, "array") else np.asarray(value).reshape(-1)
+        value = self.values_of(name).reshape(-1)
         if value.size != 1 or value.dtype.kind not in "fiub" or not np.isfinite(value[0]):
             raise FormatError(f"{self.where}'{name}' should be a number")
         return float(value[0])

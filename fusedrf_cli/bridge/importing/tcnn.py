@@ -48,24 +48,46 @@ def network_of(
         if i == len(shapes) - 1:
             matrix, bias = matrix[:outputs], bias if bias is None else bias[:outputs]
         layers.append((matrix, bias))
+    if len(layers) == 1:  # x = max(0, x) - max(0, -x)
+        (matrix, bias), same = layers[0], np.eye(outputs)
+        layers = [(np.concatenate([matrix, -matrix]), np.concatenate([bias, -bias])),
+                  (np.concatenate([same, -same], 1), None)]  # fmt: skip
     return layers, params
 
 
-def levels_of(count: int, log2_rows: int, base: int, log2_growth: float) -> list[dict]:
-    """The levels of a grid; scales are computed in float32, as there."""
+def levels_of(count: int, log2_rows: int, base: int, log2_growth: float, dense: bool = False) -> list[dict]:
+    """The levels of a grid, whose scales are computed in float32, as there; dense: every vertex has a row."""
     if not 1 <= count <= 32 or not 1 <= log2_rows <= 26 or not 1 <= base <= 1 << 16:
         raise FormatError(
             f"a hash grid of {count} levels, 2^{log2_rows} rows and {base} vertices is not read"
         )
     levels = []
     for level in range(count):
-        grown = np.exp2(np.float32(level) * np.float32(log2_growth))
+        grown = single(np.exp2, np.float32(level) * np.float32(log2_growth))
         scale = grown * np.float32(base) - np.float32(1)
         side = int(np.ceil(scale)) + 1
-        rows = min(padded(side**3, 8), 1 << log2_rows)
-        hashed = side**3 > rows
-        levels.append({"scale": float(scale), "side": side, "rows": rows, "hashed": hashed, "offset": 0.5})
+        rows = padded(side**3, 8) if dense else min(padded(side**3, 8), 1 << log2_rows)
+        if rows > 1 << 26:
+            raise FormatError(f"a grid of {side} vertices along an axis, each with a row, is not read")
+        levels.append(
+            {"scale": float(scale), "side": side, "rows": rows, "hashed": hashes(side, rows), "offset": 0.5}
+        )
     return levels
+
+
+def hashes(side: int, rows: int) -> bool:
+    """Whether so many rows are found by a hash. The product that tells wraps at 2³², as there: a level of
+    2^16 vertices is none."""
+    stride = 1
+    for _ in range(3):
+        if stride <= rows:
+            stride = stride * side % (1 << 32)
+    return rows < stride
+
+
+def single(function, value: float) -> np.float32:
+    """A function of a number in float32, rounded as a C library does."""
+    return np.float32(function(np.float64(value)))
 
 
 def rows_of(params: np.ndarray, levels: Sequence[dict], features: int) -> np.ndarray:

@@ -1,19 +1,23 @@
 """Checkpoints of torch-ngp (github.com/ashawkey/torch-ngp), and of PVD (Fang et al., AAAI 2023), which is
-built on it: hash grids, planes and lines, networks, volumes."""
+built on it: hash grids, planes and lines, networks, volumes. Its networks may be torch's, or those of its own
+fused kernels or of tiny-cuda-nn, which are one array each."""
 
+import itertools
+import operator
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from formats.errors import FormatError
-from fusedrf_cli.bridge.importing import tensorf
-from fusedrf_cli.bridge.importing.cells import cells_of_bits
+from fusedrf_cli.bridge.importing import tcnn, tensorf
+from fusedrf_cli.bridge.importing.cells import cells_of_bits, cropped, nodes_of
 from fusedrf_cli.bridge.importing.nerf import frequencies_of, joined, skipping
 from fusedrf_cli.bridge.importing.parts import (
     ColourInput,
     Entries,
     Imported,
-    ImportedNode,
+    Layer,
     beside,
     colour_network,
     eight,
@@ -25,62 +29,131 @@ from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsShape
 
 BASE, FINEST = 16, 2048  # vertices of the coarsest grid, and of the finest for each unit of the bound
-LIMITS = (-2.0, 7.0)  # of what PVD exponentiates
-SAMPLES = 297  # vertices along an axis by which rays are sampled as there, a 1024th of a diagonal apart
+LEVELS, FEATURES, LOG2_ROWS = 16, 2, 19  # of the grid of its tiny-cuda-nn version
+HARMONICS, OUTPUTS = 16, 16
+EXPONENTS = -80.0, 50.0  # as good as none
+SAMPLES = 297  # vertices along an axis by which rays are sampled where there are no cells
+LIMITS = -2.0, 7.0  # of what PVD exponentiates, by its recipe
+AXES = {f"plane_{i}": pair for i, pair in enumerate(((0, 1), (0, 2), (1, 2)))} | {
+    f"line_{i}": (2 - i,) for i in range(3)
+}
+"""Along which each of TensoRF's planes and lines runs."""
+FRAME = (
+    "it lies in the system's own coordinates, which are the capture's y, z, x, scaled and moved by options "
+    "that it does not hold"
+)
 EMA = "its moving averages (ema) are left out, as the system's own rendering does"
+RECIPE = (
+    "what it exponentiates, and colour features of planes, are taken to be kept between -2 and 7, as PVD's "
+    "options do by default"
+)
 
 
 def read(checkpoint) -> Imported:
     """The field of a checkpoint of torch-ngp. Raises FormatError."""
-    return hashed(checkpoint, (-80.0, 50.0))
+    model = Entries(checkpoint.entries).inside("model")
+    if "basis_mat.weight" in model.values:
+        return planes(checkpoint, model, "waves", EXPONENTS)
+    return hashed(checkpoint, model, EXPONENTS)
 
 
 def read_pvd(checkpoint) -> Imported:
     """The field of a checkpoint of PVD. Raises FormatError."""
-    names = Entries(checkpoint.entries).inside("model").values
-    if "encoder.embeddings" in names:
-        return hashed(checkpoint, LIMITS)
-    if "tensor_volume.0" in names:
-        return volume(checkpoint)
-    return planes(checkpoint) if "sigma_mat.0" in names else network(checkpoint)
-
-
-def hashed(checkpoint, limits: tuple[float, float]) -> Imported:
-    """A hash grid, a trunk and a colour network."""
     model = Entries(checkpoint.entries).inside("model")
-    rows, offsets = model.array("encoder.embeddings", None, None), model.array("encoder.offsets", None)
-    box = box_of(model, "aabb_infer")
-    levels = levels_of(offsets.astype(np.int64), len(rows), float(box[3]))
+    if "encoder.embeddings" in model.values:
+        made = hashed(checkpoint, model, LIMITS)
+    elif "tensor_volume.0" in model.values:
+        made = volume(checkpoint, model)
+    elif "sigma_mat.0" in model.values:
+        made = planes(checkpoint, model, "harmonics", LIMITS)
+    else:
+        made = network(checkpoint, model)
+    return replace(made, notes=[*made.notes, RECIPE])
+
+
+def hashed(checkpoint, model: Entries, limits: tuple[float, float]) -> Imported:
+    """A hash grid, a trunk and a colour network."""
+    bound = bound_of(model)
+    if "encoder.params" in model.values:
+        growth = 2 ** (np.log2(FINEST * bound / BASE) / (LEVELS - 1))
+        levels = tcnn.levels_of(LEVELS, LOG2_ROWS, BASE, tcnn.single(np.log2, np.float32(growth)))
+        rows = tcnn.rows_of(halves(model, "encoder.params"), levels, FEATURES)
+    else:
+        rows, offsets = model.array("encoder.embeddings", None, None), model.array("encoder.offsets", None)
+        levels = levels_of(offsets.astype(np.int64), len(rows), bound)
     encoding = {"part": "hash_grid", "features": rows.shape[1], "levels": levels}
-    width = eight(len(levels) * rows.shape[1])
-    sigma, sections = trunk_layers(model.layers("sigma_net."), width, limits=limits)
+    count = len(levels) * rows.shape[1]
+    sigma, sections = trunk_layers(layers_of(model, "sigma_net", count, OUTPUTS), eight(count), limits=limits)
     rgb, colours = harmonic_network(model, sigma["outputs"])
     shape = PartsShape(encoding, {"part": "trunk_features"}, sigma, rgb)
     values = {"density_rows": rows} | sections | colours
-    return finished(checkpoint, model, shape, box, (SAMPLES,) * 3, values)
+    return finished(checkpoint, model, shape, cube_of(bound), None, values)
 
 
-def planes(checkpoint) -> Imported:
-    """Planes and lines, and a colour network of 15 features."""
-    model = Entries(checkpoint.entries).inside("model")
-    density, resolution, _ = factors(model, "sigma")
-    colour, _, ranks = factors(model, "color")
+def layers_of(model: Entries, name: str, inputs: int, outputs: int) -> list[Layer]:
+    """The layers of a network: torch's, or out of one array, whose size tells how many there are."""
+    fused = f"{name}.weights" in model.values
+    whole = f"{name}.weights" if fused else f"{name}.params"
+    if whole not in model.values:
+        return model.layers(f"{name}.")
+    params = halves(model, whole)
+    for neurons, hidden in itertools.product((64, 128, 32, 16, 256), range(1, 9)):
+        shapes = tcnn.shapes_of(inputs, neurons, hidden, outputs, 16)
+        if tcnn.size_of(shapes) == len(params):
+            # tiny-cuda-nn fills inputs up with 1, the fused kernels' caller with 0
+            return tcnn.network_of(params, shapes, inputs, outputs, 0.0 if fused else 1.0)[0]
+    raise FormatError(f"'{whole}' has {len(params):,} numbers, which no network of {inputs} inputs has")
+
+
+def halves(model: Entries, name: str) -> np.ndarray:
+    """Numbers as they are computed with."""
+    return model.array(name, None).astype(np.float16).astype(np.float32)
+
+
+def planes(checkpoint, model: Entries, seen: str, limits: tuple[float, float]) -> Imported:
+    """Planes and lines, or lines alone, and a colour network of what a matrix makes of them and of the
+    direction, `seen` as "harmonics" (PVD) or with "waves" of both (torch-ngp's TensoRF)."""
+    crossed = "sigma_mat.0" in model.values
+    density, resolution, _ = factors(model, "sigma", crossed)
+    colour, colour_resolution, ranks = factors(model, "color", crossed)
+    if resolution != colour_resolution:
+        raise FormatError(f"grids of density and colour are of {resolution} and {colour_resolution} texels")
     basis = model.array("basis_mat.weight", None, sum(ranks))
-    order = ColourInput(len(basis), len(basis), harmonics=True)
-    columns = np.concatenate([order.at("direction"), order.at("features")])
-    rgb, sections = colour_network(model.layers("color_net."), order, columns, rows=len(basis))
-    basis = beside(np.split(basis, np.cumsum(ranks)[:-1], 1), ranks_filled(ranks))
+    layers, count = model.layers("color_net."), len(basis)
+    if seen == "harmonics":
+        order = ColourInput(count, count, harmonics=True)
+        columns = [order.at("direction"), order.at("features")]
+    else:
+        waves = max(0, (layers[0][0].shape[1] // (count + 3) - 1) // 2)
+        order = ColourInput(count, count, waves)
+        columns = [
+            index
+            for which in ("features", "direction")
+            for index in (order.at(which), order.waves(which, waves, by_level=True))
+        ]
+    rgb, sections = colour_network(layers, order, np.concatenate(columns), rows=count)
+    filled = ranks_filled(ranks)
+    basis = beside(np.split(basis, np.cumsum(ranks)[:-1], 1), filled)
+    box = cube_of(bound_of(model))
+    if crossed:
+        box, around = with_zeros(box_of(model, "aabb_train"), resolution, box)
+        resolution = tuple(n + sum(more) for n, more in zip(resolution, around, strict=True))
+        density, colour = (
+            {name: np.pad(made[name], [*(around[axis] for axis in AXES[name]), (0, 0)]) for name in made}
+            for made in (density, colour)
+        )
     values = {f"density_{name}": value for name, value in density.items()} | sections
     values |= {f"colour_{name}": value for name, value in colour.items()} | {"rgb_basis": basis}
-    encodings = [{"part": "plane_line", "rank": made["line_0"].shape[-1]} for made in (density, colour)]
-    sigma = {"part": "density_sum", "activation": "exp", "limits": LIMITS}
-    shape = PartsShape(*encodings, sigma, rgb | {"limits": LIMITS})
-    return finished(checkpoint, model, shape, box_of(model, "aabb_train"), resolution, values)
+    part = "plane_line" if crossed else "line"
+    encodings = [{"part": part, "rank": made["line_0"].shape[-1]} for made in (density, colour)]
+    sigma = {"part": "density_sum", "activation": "exp", "limits": list(limits)}
+    rgb |= {"limits": list(limits)} if seen == "harmonics" else {}
+    shape = PartsShape(*encodings, sigma, rgb)
+    return finished(checkpoint, model, shape, box, resolution, values)
 
 
-def volume(checkpoint) -> Imported:
+def volume(checkpoint, model: Entries) -> Imported:
     """A grid of density and spherical harmonics."""
-    model = Entries(checkpoint.entries).inside("model")
     grid = model.array("tensor_volume.0", 1, None, None, None, None)[0].transpose(3, 2, 1, 0)
     coefficients, rest = divmod(grid.shape[-1] - 1, 3)
     if rest or coefficients not in (1, 4, 9, 16):
@@ -92,39 +165,77 @@ def volume(checkpoint) -> Imported:
         {"part": "density_sum", "activation": "exp", "limits": LIMITS},
         {"part": "sh", "coefficients": coefficients},
     )  # fmt: skip
+    box, around = with_zeros(box_of(model, "aabb_train"), grid.shape[:3], cube_of(bound_of(model)))
+    grid = np.pad(grid, [*around, (0, 0)])
     values = {"density_": grid[..., 0], "colour_": grid[..., 1:]}
-    return finished(checkpoint, model, shape, box_of(model, "aabb_train"), grid.shape[:3], values)
+    return finished(checkpoint, model, shape, box, grid.shape[:3], values)
 
 
-def network(checkpoint) -> Imported:
+def network(checkpoint, model: Entries) -> Imported:
     """NeRF's network, in front of the trunk."""
-    model = Entries(checkpoint.entries).inside("model")
     layers, trunk = model.layers("nerf_mlp."), model.layers("sigma_net.")
     frequencies = frequencies_of(layers[0][0].shape[1])
     # its last layer has no activation, and goes with the trunk's first
     layers = [*layers[:-1], joined(layers[-1], trunk[0]), *trunk[1:]]
-    box = box_of(model, "aabb_infer")
     sigma, sections = skipping(layers, frequencies, hidden_first=False)
     sigma |= {"activation": "exp", "limits": list(LIMITS)}
     rgb, colours = harmonic_network(model, sigma["outputs"])
     encoding = {"part": "frequencies", "count": frequencies, "frame": True}
     shape = PartsShape(encoding, {"part": "trunk_features"}, sigma, rgb)
-    return finished(checkpoint, model, shape, box, (SAMPLES,) * 3, sections | colours)
+    return finished(checkpoint, model, shape, cube_of(bound_of(model)), None, sections | colours)
 
 
 def finished(
-    checkpoint, model: Entries, shape: PartsShape, box: np.ndarray, resolution: Sequence[int], values: dict
-) -> Imported:
-    """The import of a field over a box, in the cells that the file holds occupied."""
-    cells = OccupancyGrid.full(box)
+    checkpoint, model: Entries, shape: PartsShape, box: np.ndarray, resolution: Sequence[int] | None,
+    values: dict,
+) -> Imported:  # fmt: skip
+    """The import of a field over a box, in the cells that the file holds occupied; resolution: of its texels,
+    None where it has none."""
+    bound, of_texels = bound_of(model), resolution is not None
+    grids = [OccupancyGrid.full(cube_of(bound))]
     if "density_bitfield" in model.values:
-        bound = float(box_of(model, "aabb_infer")[3])
-        cascades = 1 + int(np.ceil(np.log2(max(bound, 1))))
         bits = np.unpackbits(model.array("density_bitfield", None).astype(np.uint8), bitorder="little")
-        cells = cells_of_bits(bits.astype(bool), cascades, bound)
-    field = parts_field(shape, box, resolution, values, occupancy=cells)
-    notes = [EMA] if "ema" in checkpoint.entries else []
-    return Imported([ImportedNode(field)], notes)
+        grids = cells_of_bits(bits.astype(bool), bound)
+    shown = cropped(grids, box_of(model, "aabb_infer"))
+    cells = cropped(shown, box)
+    field = parts_field(shape, box, resolution or (SAMPLES,) * 3, values)
+    notes = [FRAME, *([EMA] if "ema" in checkpoint.entries else [])]
+    if any(str(name).startswith(("bg_net.", "bg_mat")) for name in model.values):
+        notes.append("its network of what lies behind the scene (bg_net) is left out")
+    if not all(map(operator.is_, shown, grids)):
+        notes.append("it is cut to the box that the system's pictures show (aabb_infer)")
+    return Imported(nodes_of(field, cells, np.eye(4), of_texels), notes)
+
+
+def bound_of(model: Entries) -> float:
+    """How far out the scene's cube goes: that of the larger of the two boxes that is a cube around 0."""
+    boxes = [box_of(model, name) for name in ("aabb_train", "aabb_infer")]
+    bounds = [float(box[3]) for box in boxes if np.array_equal(box, cube_of(box[3]))]
+    if not bounds:
+        found = [box.tolist() for box in boxes]
+        raise FormatError(f"'aabb_train' or 'aabb_infer' should be a cube around 0, found {found}")
+    return max(bounds)
+
+
+def with_zeros(
+    box: np.ndarray, resolution: Sequence[int], cube: np.ndarray
+) -> tuple[np.ndarray, list[tuple[int, int]]]:
+    """The box (6,) with as many texels of 0 around as reach the cube (6,) that cells lie in, on each axis and
+    side: what lies outside counts as 0 there, and is exponentiated. No more than there are texels."""
+    if min(resolution) < 2:
+        raise FormatError(f"grids should have 2 texels along an axis at least, found {list(resolution)}")
+    texel = (box[3:] - box[:3]) / (np.array(resolution) - 1)
+    before, after = (
+        np.minimum(np.ceil(np.maximum(more, 0) / texel), resolution).astype(int)
+        for more in (box[:3] - cube[:3], cube[3:] - box[3:])
+    )
+    wider = np.concatenate([box[:3] - before * texel, box[3:] + after * texel])
+    return wider, list(zip(before.tolist(), after.tolist(), strict=True))
+
+
+def cube_of(bound: float) -> np.ndarray:
+    """The box (6,) out to ±bound."""
+    return np.array([-bound] * 3 + [bound] * 3)
 
 
 def box_of(model: Entries, name: str) -> np.ndarray:
@@ -144,29 +255,29 @@ def levels_of(offsets: np.ndarray, rows: int, bound: float) -> list[dict]:
     growth = np.float32(np.log2(2 ** (np.log2(FINEST * bound / BASE) / max(count - 1, 1))))
     levels = []
     for level, held in enumerate(np.diff(offsets)):
-        scale = np.exp2(np.float32(level) * growth) * np.float32(BASE) - np.float32(1)
-        side = int(np.ceil(scale)) + 2
-        hashed = bool(side**3 > held)
-        levels.append(
-            {"scale": float(scale), "side": side, "rows": int(held), "hashed": hashed, "offset": 0.5}
-        )
+        scale = tcnn.single(np.exp2, np.float32(level) * growth) * np.float32(BASE) - np.float32(1)
+        side, held = int(np.ceil(scale)) + 2, int(held)
+        found = tcnn.hashes(side, held)
+        levels.append({"scale": float(scale), "side": side, "rows": held, "hashed": found, "offset": 0.5})
     return levels
 
 
 def harmonic_network(model: Entries, outputs: int) -> tuple[dict, dict[str, np.ndarray]]:
     """A colour network of harmonics and of the trunk's outputs but for the first."""
     order = ColourInput(outputs, outputs, harmonics=True)
-    layers = model.layers("color_net.")
-    features = order.at("features")[1 : 1 + layers[0][0].shape[1] - len(order.at("direction"))]
+    layers = layers_of(model, "color_net", HARMONICS + OUTPUTS - 1, 3)
+    features = order.at("features")[1 : 1 + layers[0][0].shape[1] - HARMONICS]
     return colour_network(layers, order, np.concatenate([order.at("direction"), features]))
 
 
-def factors(model: Entries, which: str) -> tuple[dict[str, np.ndarray], tuple, list[int]]:
-    """Planes and lines, laid out as TensoRF's (tensorf.py), by the names of our sections; texels per axis,
-    and ranks."""
+def factors(
+    model: Entries, which: str, crossed: bool
+) -> tuple[dict[str, np.ndarray], tuple[int, int, int], list[int]]:
+    """Planes and lines, or lines alone, laid out as TensoRF's (tensorf.py), by the names of our sections;
+    texels per axis, and ranks."""
     renamed = {
         f"app_{part}.{i}": model.get(f"{which}_{there}.{i}")
-        for part, there in (("plane", "mat"), ("line", "vec"))
+        for part, there in (("plane", "mat"), ("line", "vec"))[0 if crossed else 1 :]
         for i in range(3)
     }
-    return tensorf.factors(Entries(renamed), "app", True)
+    return tensorf.factors(Entries(renamed), "app", crossed)

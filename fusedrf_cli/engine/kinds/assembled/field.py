@@ -125,11 +125,24 @@ class PartsField(AssembledField):
 
     kind = "assembled"
     shape_type = PartsShape
+    hash_rows = "hash.rows"
+    """What files call the rows of a hash grid: a part of its own."""
 
     @classmethod
     def slots_of(cls, shape: PartsShape) -> dict[str, Slot]:
         """See AssembledField."""
         return shape.slots()
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict]:
+        """See BoxField; rows of a hash grid are a part that fields may have in common, as those do that are
+        one field in several grids of cells."""
+        arrays, metadata = super().state()
+        return arrays, metadata | ({"shared": ["hash"]} if self.hash_rows in arrays else {})
+
+    @classmethod
+    def stored_name(cls, name: str) -> str:
+        """See BoxField."""
+        return cls.hash_rows if name == "density_rows" else name
 
     @cached_property
     def colour_activation(self) -> str:
