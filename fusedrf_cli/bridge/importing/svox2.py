@@ -95,7 +95,7 @@ def grid_of(entries: Entries, middle: np.ndarray, radius: np.ndarray) -> Importe
         {"part": "density_sum", "activation": "relu"}, rgb, "relu",
     )  # fmt: skip
     values = {f"density_{name}": table for name, table in tables.items()}
-    values |= {"density_rows": density, "colour_rows": colour, **basis}
+    values |= {"density_values": density, "colour_values": colour, **basis}
     return ImportedNode(parts_field(shape, around, resolution, values, occupancy=occupancy))
 
 
@@ -200,8 +200,8 @@ def background_of(entries: Entries, middle: np.ndarray, radius: np.ndarray) -> I
     )  # fmt: skip
     columns, rows = np.maximum(links, -1), data.reshape(-1, 4)
     values = {
-        "density_columns": columns, "density_rows": rows[:, 3:],
-        "colour_columns": columns, "colour_rows": rows[:, :3],
+        "density_columns": columns, "density_values": rows[:, 3:],
+        "colour_columns": columns, "colour_values": rows[:, :3],
     }  # fmt: skip
     scale = np.prod(radius) ** (1 / 3)
     units = {f"unit_{axis}": float(r / scale) for axis, r in zip("xyz", radius, strict=True)}

@@ -50,7 +50,7 @@ def sections(resolution: tuple[int, int, int], rows: int, blocks: int) -> list[P
     return [
         ParameterBlock("blocks", tuple(-(-n // SIDE) for n in resolution), rate=0, whole=True),
         ParameterBlock("vertices", (blocks, SIDE**3), rate=0, whole=True),
-        ParameterBlock("rows", (rows, 1)),
+        ParameterBlock("values", (rows, 1)),
     ]
 
 
@@ -75,7 +75,7 @@ def arrays(field, starts: np.ndarray, **options) -> Arrays:
 
 def reference(field, sections: dict, unit: torch.Tensor, read: None, rows: int, blocks: int) -> torch.Tensor:
     """See encodings."""
-    return blend(sections, sections["rows"], field.resolution, unit)
+    return blend(sections, sections["values"], field.resolution, unit)
 
 
 def blend(
@@ -102,7 +102,7 @@ def bound(sections: dict, read: None, rows: int, blocks: int) -> torch.Tensor:
     """See encodings. Raises ValueError where a table leads to what there is not."""
     check_whole(sections["blocks"], "blocks", blocks)
     check_whole(sections["vertices"], "vertices", rows)
-    return largest(sections["rows"], kept=1)
+    return largest(sections["values"], kept=1)
 
 
 # -- compiled ------------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ def sizes(numbers: int, rows: int) -> dict[str, int]:
 
 def sections(resolution: tuple[int, int, int], numbers: int, rows: int) -> list[ParameterBlock]:
     """See encodings."""
-    return [ParameterBlock("rows", (rows, sizes(numbers, rows)["WIDTH"]), columns=numbers)]
+    return [ParameterBlock("values", (rows, sizes(numbers, rows)["WIDTH"]), columns=numbers)]
 
 
 def arrays(field, starts: np.ndarray, **options) -> Arrays:
@@ -43,12 +43,12 @@ def reference(
     field, sections: dict, unit: torch.Tensor, read: None, numbers: int, rows: int
 ) -> torch.Tensor:  # fmt: skip
     """See encodings."""
-    return blend(field.slot_sections()["density"], sections["rows"], field.resolution, unit)
+    return blend(field.slot_sections()["density"], sections["values"], field.resolution, unit)
 
 
 def bound(sections: dict, read: None, **options) -> torch.Tensor:
     """See encodings."""
-    return largest(sections["rows"], kept=1)
+    return largest(sections["values"], kept=1)
 
 
 # -- compiled ------------------------------------------------------------------------------------------------

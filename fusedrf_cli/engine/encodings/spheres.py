@@ -51,7 +51,7 @@ def sections(resolution: tuple, numbers: int, wide: int, high: int, layers: int,
     """See encodings."""
     return [
         ParameterBlock("columns", (wide, high), rate=0, whole=True),
-        ParameterBlock("rows", (columns * layers, numbers)),
+        ParameterBlock("values", (columns * layers, numbers)),
     ]
 
 
@@ -83,7 +83,7 @@ def reference(
         weight = torch.where(offset == 1, share, 1 - share).prod(1)
         i, j, k = (lower + offset).unbind(1)
         column = sections["columns"][i % wide, j % high].round().long()
-        rows = sections["rows"][column.clamp_min(0) * layers + k.clamp_max(layers - 1)]
+        rows = sections["values"][column.clamp_min(0) * layers + k.clamp_max(layers - 1)]
         total = total + (weight * (column >= 0))[:, None].to(rows.dtype) * rows
     return total
 
@@ -91,7 +91,7 @@ def reference(
 def bound(sections: dict, read: None, columns: int, **options) -> torch.Tensor:
     """See encodings. Raises ValueError where the table leads to what there is not."""
     check_whole(sections["columns"], "columns", columns)
-    return largest(sections["rows"], kept=1)
+    return largest(sections["values"], kept=1)
 
 
 # -- compiled ------------------------------------------------------------------------------------------------
