@@ -246,7 +246,7 @@ def hybrid_decoders(state, sigma_net, columns, width, codes, rest):
 
 def explicit_decoders(state, sigma_net, columns, width, codes, rest):
     """The same of a density that is linear in the features, and a learnt basis of directions."""
-    weight, bias = sigma_net[0]  # W x, as tcnn.network_of says it by two layers: [W, -W] comes first
+    ((weight, bias),) = sigma_net
     shift = (0.0 if bias is None else float(bias[0])) + SHIFT * (rest["activation"] == "exp")
     weights = np.append(scattered(weight, columns, width)[0], shift)
     read, count = 3 + (0 if codes is None else len(codes)), len(columns)
