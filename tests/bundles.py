@@ -32,5 +32,6 @@ def parse_bundle(data: bytes | bytearray, where: str) -> Bundle:
 
 
 def field_kinds() -> dict[str, type]:
-    """The fields that bundles may hold, by kind."""
-    return {kind.name: kind.field for kind in registry.kinds() if kind.field is not None}
+    """The fields that bundles may hold and that learn, by kind."""
+    kinds = (kind for kind in registry.kinds() if kind.name not in registry.IMPORTED)
+    return {kind.name: kind.field for kind in kinds if kind.field is not None}

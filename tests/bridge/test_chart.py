@@ -260,7 +260,7 @@ def test_sizes_are_rounded_down_to_what_the_flag_reads_back(size):
     assert BytesType().parse(in_words(floor)) == floor
 
 
-@pytest.mark.parametrize("kind", registry.names())
+@pytest.mark.parametrize("kind", sorted({*registry.names()} - registry.IMPORTED))
 def test_the_flags_of_a_rung_are_its_keywords(kind):
     for sweep in itertools.chain(*registry.kind(kind).sweeps(30).values()):
         sweep_point = next(sweep)

@@ -23,7 +23,8 @@ from tests.bridge.conftest import TinySettings, done, write_scene_of
 from tests.bridge.test_edit import AT, blues, covered
 
 QUICK = {"blocks", "vm"}  # the others' loops take half a minute each to compile
-KINDS = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in registry.names()]
+LEARNT = [name for name in registry.names() if name not in registry.IMPORTED]
+KINDS = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in LEARNT]
 SIZE = 900_000
 PHOTOS = ("train", "photos", "-o", "out.rfpack", "--aabb", "-0.5,-0.5,-0.5,0.5,0.5,0.5")
 
