@@ -94,13 +94,18 @@ def of_system(request: ImportRequest, capture: Capture | None, memory: Memory) -
     return title, replace(imported, notes=[*checkpoint.notes, *imported.notes])
 
 
+def is_read(key: object, value: object) -> bool:
+    """Whether an entry may be part of a field."""
+    return "optim" not in str(key) or isinstance(value, dict) and "target" in value
+
+
 def bytes_of(entries: object) -> float:
     """Of the arrays that a field may be made of: what optimisers keep is never read."""
     if isinstance(entries, StoredTensor):
         return 4.0 * np.prod(entries.shape, dtype=float)
     if isinstance(entries, dict):
-        kept = (key for key in entries if "optim" not in str(key) or "target" in entries[key])
-        return sum(bytes_of(entries[key]) for key in kept if key != "param_states")
+        entries = entries.get("target", entries)  # an optimiser of Flax holds what it optimises
+        return sum(bytes_of(value) for key, value in entries.items() if is_read(key, value))
     return float(len(entries)) if isinstance(entries, bytes) else 0.0
 
 

@@ -197,9 +197,11 @@ def density_net(
             shapes = tcnn.shapes_of(inputs, BASIS_HIDDEN, 0, 1, tcnn.PADDED["CutlassMLP"])
         else:
             shapes = tcnn.shapes_of(inputs, HIDDEN, 1, GEOMETRY + 1, tcnn.PADDED["FullyFusedMLP"])
-        if tcnn.size_of(shapes) == len(params):
-            outputs = 1 if explicit else GEOMETRY + 1
-            fitting.append((tcnn.network_of(params, shapes, inputs, outputs, 1.0)[0], summed))
+        if tcnn.size_of(shapes) == len(params) and explicit:
+            matrix = params.reshape(shapes[0])[:1]
+            fitting.append(([(matrix[:, :inputs], matrix[:, inputs:].sum(1))], summed))
+        elif tcnn.size_of(shapes) == len(params):
+            fitting.append((tcnn.network_of(params, shapes, inputs, GEOMETRY + 1, 1.0)[0], summed))
     if not fitting:
         raise FormatError(
             f"'{FIELD}sigma_net.params' has {len(params):,} numbers, which no network of {features} features "
@@ -247,7 +249,7 @@ def hybrid_decoders(state, sigma_net, columns, width, codes, rest):
 def explicit_decoders(state, sigma_net, columns, width, codes, rest):
     """The same of a density that is linear in the features, and a learnt basis of directions."""
     ((weight, bias),) = sigma_net
-    shift = (0.0 if bias is None else float(bias[0])) + SHIFT * (rest["activation"] == "exp")
+    shift = float(bias[0]) + SHIFT * (rest["activation"] == "exp")
     weights = np.append(scattered(weight, columns, width)[0], shift)
     read, count = 3 + (0 if codes is None else len(codes)), len(columns)
     params = halves(state, FIELD + "color_basis.params")
