@@ -209,7 +209,11 @@ def _fits(rule: str, names: list[str]) -> bool:
 
 _GRIDS = "model_state_dict:* model_state_dict/density.*:* model_state_dict/k0.*:*"
 SYSTEMS = {  # the first whose rule fits counts
-    "tensorf": System("TensoRF", "kwargs:* state_dict/density_line.0:* state_dict/app_line.0:*"),
+    "tensorf": System(
+        "TensoRF",
+        "kwargs:* state_dict/density_line.0:* state_dict/app_line.0:* "
+        "| kwargs:* state_dict/plane_coef:* state_dict/line_coef:*",
+    ),
     "svox2": System("Plenoxels (svox2)", "links:* density_data:* sh_data:* | links:* data:*", ("args.json",)),
     "dcvgo": System("DVGO (unbounded)", f"model_state_dict/scene_radius:* {_GRIDS}", ("config.py",)),
     "dmpigo": System(
@@ -217,7 +221,11 @@ SYSTEMS = {  # the first whose rule fits counts
         f"model_state_dict/act_shift.grid:* {_GRIDS} | model_state_dict/act_shift:1x1x1x1x* {_GRIDS}",
         ("config.py",),
     ),
-    "dvgo": System("DVGO", f"model_kwargs:* {_GRIDS}", ("config.py",)),
+    "dvgo": System(  # of its first version without classes of grids
+        "DVGO",
+        f"model_kwargs:* {_GRIDS} | model_kwargs:* model_state_dict/density:* model_state_dict/k0:*",
+        ("config.py",),
+    ),
     "instant-ngp": System("instant-ngp", "snapshot/params_binary:*"),
     "hashnerf": System("HashNeRF", "network_fn_state_dict:* embed_fn_state_dict:*", ("args.txt",)),
     "nerf-pytorch": System("nerf-pytorch", "network_fn_state_dict/pts_linears.0.weight:*", ("args.txt",)),

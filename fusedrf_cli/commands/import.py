@@ -19,16 +19,19 @@ from fusedrf_cli.option_types import BoxType, InputType, PositiveType, VectorTyp
     "--cameras", type=InputType(), metavar="CAPTURE", help="The capture it was learnt from: keep its cameras."
 )
 @click.option("--up", type=VectorType(), help="Which way of its world is up; default: as its format has it.")
-@click.option("--time", type=float, help="Take a moving scene at this time.")
+@click.option(
+    "--time", type=float, help="Take a moving scene at this time: K-Planes' from -1 to 1, D²NeRF's from 0 on."
+)
 @options.imported_precision
 @options.memory
 @options.reporting
 def command(**words):
     """Turn another system's file into a bundle of its numbers.
 
-    FILE is a checkpoint of TensoRF, Plenoxels (svox2), DVGO, Instant-NGP, NeRF (nerf-pytorch),
-    torch-ngp, PVD or nerfacto, or the folder of a run, whose newest checkpoint is taken; or Gaussian
-    splats: .ply, .spz, .sog, .splat, .ksplat or glTF. Files are told apart by what they hold.
+    FILE is a checkpoint of TensoRF, Plenoxels (svox2), DVGO, Instant-NGP, NeRF (nerf-pytorch), HashNeRF,
+    torch-ngp, PVD, nerfacto, K-Planes or D²NeRF, or the folder of a run, whose newest checkpoint is
+    taken; or Gaussian splats: .ply, .spz, .sog, .splat, .ksplat or glTF. Files are told apart by
+    what they hold.
     Nothing in them is run, and nothing is learnt.
 
     \b

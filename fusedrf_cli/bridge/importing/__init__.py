@@ -19,7 +19,7 @@ from formats.scene import SceneGraph, make_node
 from formats.splats.reading import is_splats
 from formats.views import Capture
 from fusedrf_cli import __version__
-from fusedrf_cli.bridge.importing import splats
+from fusedrf_cli.bridge.importing import nerf, splats
 from fusedrf_cli.bridge.importing.parts import Imported
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.engine.kinds import registry
@@ -38,10 +38,20 @@ READERS = {
     "nerfacto": ("nerfacto", "read"),
     "nerf-pytorch": ("nerf", "read"),
     "krrish-nerf": ("nerf", "read_krrish"),
+    "hashnerf": ("nerf", "read_hashed"),
+    "k-planes": ("k_planes", "read"),
+    "d2nerf": ("d2nerf", "read"),
 }
 """The module and the function that read a system's checkpoint."""
-BOXLESS = "nerf-pytorch", "krrish-nerf"
+BOXLESS = "nerf-pytorch", "krrish-nerf", "hashnerf", "d2nerf"
 """Systems whose files have no box."""
+MOVING = "k-planes", "d2nerf"
+"""Systems whose scenes may move."""
+UNREAD = {
+    "dmpigo": "its density is counted along the axis of a camera, and its colours depend on directions "
+    "outside its space, which the file does not tell; train it with DVGO's bounded or unbounded model"
+}
+"""Why checkpoints of a system are not read, where that is known."""
 COPIES = 4.0
 """Of an array, of what its field takes: read, rearranged, as numbers and as they are written."""
 
@@ -76,13 +86,17 @@ def of_system(request: ImportRequest, capture: Capture | None, memory: Memory) -
     title = SYSTEMS[checkpoint.system].title
     if checkpoint.system not in READERS:
         known = ", ".join(SYSTEMS[name].title for name in READERS)
-        raise InvalidInput(
-            f"{checkpoint.path}: a checkpoint of {title}, which is not read; read are those of {known}"
-        )
+        because = UNREAD.get(checkpoint.system, f"read are those of {known}")
+        raise InvalidInput(f"{checkpoint.path}: a checkpoint of {title}, which is not read; {because}")
     parts = {"the field": COPIES * bytes_of(checkpoint.entries)}
     memory.expect(parts, advice="close other programs, or raise --memory")
     imported = imported_from(checkpoint, request, capture)
     return title, replace(imported, notes=[*checkpoint.notes, *imported.notes])
+
+
+def is_read(key: object, value: object) -> bool:
+    """Whether an entry may be part of a field."""
+    return "optim" not in str(key) or isinstance(value, dict) and "target" in value
 
 
 def bytes_of(entries: object) -> float:
@@ -90,7 +104,8 @@ def bytes_of(entries: object) -> float:
     if isinstance(entries, StoredTensor):
         return 4.0 * np.prod(entries.shape, dtype=float)
     if isinstance(entries, dict):
-        return sum(bytes_of(value) for key, value in entries.items() if "optim" not in str(key))
+        entries = entries.get("target", entries)  # an optimiser of Flax holds what it optimises
+        return sum(bytes_of(value) for key, value in entries.items() if is_read(key, value))
     return float(len(entries)) if isinstance(entries, bytes) else 0.0
 
 
@@ -101,20 +116,28 @@ def imported_from(checkpoint: Checkpoint, request: ImportRequest, capture: Captu
     boxless = checkpoint.system in BOXLESS
     if not boxless and (request.aabb or request.near or request.far):
         raise UsageProblem("--aabb, --near and --far are for files without a box, and this one has its own")
-    box = [box_of(request, capture)] if boxless else []
+    given = {"box": box_of(request, capture, checkpoint)} if boxless else {}
+    given |= {"time": request.time} if checkpoint.system in MOVING else {}
     try:
-        return read(checkpoint, *box)
+        return read(checkpoint, **given)
     except (FormatError, ValueError) as error:
         raise InvalidInput(f"{checkpoint.path}: {error}") from error
 
 
-def box_of(request: ImportRequest, capture: Capture | None) -> np.ndarray:
+def box_of(request: ImportRequest, capture: Capture | None, checkpoint: Checkpoint) -> np.ndarray:
     """The box (6,) of a field whose file has none: as given, or what cameras see between two distances."""
     if request.aabb is not None:
         box = np.array(request.aabb)
         if not (box[:3] < box[3:]).all():
             raise UsageProblem(f"--aabb should be three minima below three maxima, found {request.aabb}")
         return box
+    if checkpoint.system == "hashnerf":
+        if (stated := nerf.hashed_box(checkpoint)) is None:
+            raise UsageProblem(
+                f"{request.path} does not say which box its hash grid fills; give it as --aabb "
+                "xmin,ymin,zmin,xmax,ymax,zmax, exactly as its run had it"
+            )
+        return stated
     if capture is None or request.near is None or request.far is None:
         raise UsageProblem(
             f"{request.path} does not say where its scene lies; give the box as --aabb "

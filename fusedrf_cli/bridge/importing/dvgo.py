@@ -1,5 +1,6 @@
 """DVGO's checkpoints (Sun et al., CVPR 2022, and its second version; github.com/sunset1995/DirectVoxGO):
-DirectVoxGO and DirectContractedVoxGO, on dense or TensoRF grids."""
+DirectVoxGO and DirectContractedVoxGO, on dense or TensoRF grids, and those of earlier versions, but for
+colours that depend on the point beside the grid."""
 
 import numpy as np
 
@@ -16,34 +17,67 @@ from fusedrf_cli.bridge.importing.parts import (
     parts_field,
     ranks_filled,
 )
+from fusedrf_cli.bridge.importing.tensorf import between
+from fusedrf_cli.engine.fields.box import checked_box
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsShape
 from fusedrf_cli.engine.spaces import bounded, contracted_l2, contracted_linf, space_of
 
+NORM = "it does not say by which norm it is contracted, so 'inf' is taken; earlier versions had 'l2'"
+MASK = "of the coarse densities that mask it, only at which vertices they do is in the file"
 MODES = (("xy", "z", 0, 1, 2), ("xz", "y", 0, 2, 1), ("yz", "x", 1, 2, 0))
+
+
+OTHERWISE = "nearest", "pre_act_density", "in_act_density"
+"""Options of the first version by which a grid is read otherwise."""
 
 
 def read(checkpoint) -> Imported:
     """The field of a checkpoint. Raises FormatError."""
     entries = Entries(checkpoint.entries)
     kwargs, state = entries.inside("model_kwargs"), entries.inside("model_state_dict")
+    check_version(kwargs, state)
     box = np.concatenate([bounds(state, kwargs, name) for name in ("xyz_min", "xyz_max")])
+    box = checked_box(box.tolist(), "the box from 'xyz_min' to 'xyz_max'")
     density, values, resolution, _ = grid_of(state, "density")
     colour, more, colour_resolution, basis = grid_of(state, "k0")
     if resolution != colour_resolution:
         raise FormatError(f"grids of density and colour are of {resolution} and {colour_resolution} vertices")
     values |= more
-    count = len(basis) if basis is not None else colour["numbers"]
+    count = len(basis) if basis is not None else state.get(dense_name(state, "k0")).shape[1]
     rgb, shading = shading_of(kwargs, state, count, basis)
     shape = PartsShape(density, colour, {"part": "density_sum"}, rgb)
-    space, placement = space_and_placement(kwargs, state, box)
-    base = (np.prod(box[3:] - box[:3]) / kwargs.number("num_voxels_base")) ** (1 / 3)
-    if not base > 0:
-        raise FormatError("model_kwargs: 'num_voxels_base' should be above 0")
-    cells = cells_of(state, box, space)
-    shift = state.number("act_shift")
-    field = parts_field(shape, box, resolution, values | shading, 1 / base, shift, cells)
-    return Imported([ImportedNode(field, placement)])
+    space, placement, notes = space_and_placement(kwargs, state, box)
+    if not (voxels := kwargs.number("num_voxels_base")) > 0:
+        raise FormatError(f"model_kwargs: 'num_voxels_base' should be above 0, found {voxels:g}")
+    base = (np.prod(box[3:] - box[:3]) / voxels) ** (1 / 3)
+    cells, more_notes = cells_of(state, box, space)
+    field = parts_field(shape, box, resolution, values | shading, 1 / base, shift_of(kwargs, state), cells)
+    return Imported([ImportedNode(field, placement)], notes + more_notes)
+
+
+def check_version(kwargs: Entries, state: Entries) -> None:
+    """Refuse what only the first version does. Raises FormatError."""
+    said = [name for name in OTHERWISE if kwargs.values.get(name)]
+    if "posfreq" in state.values:
+        said.append("posbase_pe")  # colours that read the point as well
+    if kwargs.values.get("rgbnet_full_implicit"):
+        said.append("rgbnet_full_implicit")  # colours that read no grid
+    if said:
+        raise FormatError(
+            f"model_kwargs: '{said[0]}' of DVGO's first version is not taken over; train it with the second"
+        )
+
+
+def shift_of(kwargs: Entries, state: Entries) -> float:
+    """What is added to a density before its activation: earlier versions have it from the opacity that
+    training began with."""
+    if "act_shift" in state.values or "density" not in state.values:
+        return state.number("act_shift")
+    begun = kwargs.number("alpha_init")
+    if not 0 < begun < 1:
+        raise FormatError(f"model_kwargs: 'alpha_init' should be between 0 and 1, found {begun:g}")
+    return float(np.log(1 / (1 - begun) - 1))
 
 
 def bounds(state: Entries, kwargs: Entries, name: str) -> np.ndarray:
@@ -51,16 +85,22 @@ def bounds(state: Entries, kwargs: Entries, name: str) -> np.ndarray:
     return (state if name in state.values else kwargs).array(name, 3).astype(np.float64)
 
 
+def dense_name(state: Entries, which: str) -> str:
+    """What a dense grid is called: before there were others, without a class of its own."""
+    return which if which in state.values else f"{which}.grid"
+
+
 def grid_of(state: Entries, which: str) -> tuple[dict, dict[str, np.ndarray], tuple, np.ndarray | None]:
     """The entry of an encoding, its sections, texels per axis, and the matrix that makes features of those of
     a TensoRF grid."""
     slot = {"density": "density", "k0": "colour"}[which]
-    if f"{which}.grid" in state.values:
-        grid = state.array(f"{which}.grid", 1, None, None, None, None)[0]
+    if (name := dense_name(state, which)) in state.values:
+        grid = state.array(name, 1, None, None, None, None)[0]
         if which == "density" and len(grid) != 1:
-            raise FormatError(f"'density.grid' should have one number at a vertex, found {len(grid)}")
-        rows = grid[0] if len(grid) == 1 else grid.transpose(1, 2, 3, 0)
-        return {"part": "grid", "numbers": len(grid)}, {f"{slot}_": rows}, grid.shape[1:], None
+            raise FormatError(f"'{name}' should have one number at a vertex, found {len(grid)}")
+        rows = grid[0] if which == "density" else grid.transpose(1, 2, 3, 0)
+        numbers = 1 if which == "density" else max(2, len(grid))  # one alone would be no row
+        return {"part": "grid", "numbers": numbers}, {f"{slot}_": rows}, grid.shape[1:], None
     vectors = {axis: state.array(f"{which}.{axis}_vec", 1, None, None, 1)[0, :, :, 0] for axis in "xyz"}
     resolution = tuple(vectors[axis].shape[1] for axis in "xyz")
     ranks = [len(vectors[axis]) for _, axis, *_ in MODES]
@@ -89,11 +129,16 @@ def shading_of(
             return {"part": "rgb"}, {}
         return {"part": "sh_basis", "coefficients": 1}, {"rgb_basis": basis[:, None] / Y0}
     frequencies = kwargs.whole("viewbase_pe", 0, 16, 4)
+    if "viewfreq" in state.values:
+        bands = state.array("viewfreq", None)
+        frequencies = len(bands)
+        if not np.array_equal(bands, 2.0 ** np.arange(frequencies)):
+            raise FormatError(f"'viewfreq' should be 1, 2, 4 and so on, found {bands.tolist()[:9]}")
     layers = state.layers("rgbnet.")
     # not all versions say whether the first three features are diffuse; the first layer's width does
     direct = layers[0][0].shape[1] == count + 3 + 6 * frequencies
     rows = count if basis is not None else 0
-    order = ColourInput(count, rows or eight(count), frequencies)
+    order = ColourInput(count, rows or eight(count), frequencies, alone=True)
     read = order.at("features")[0 if direct else 3 :]
     columns = np.concatenate([read, order.at("direction"), order.waves("direction", frequencies)])
     entry, sections = colour_network(layers, order, columns, rows=rows, diffuse=not direct)
@@ -101,32 +146,39 @@ def shading_of(
 
 
 def space_and_placement(kwargs: Entries, state: Entries, box: np.ndarray):
-    """The space that the grid lies in, and its frame's placement (4, 4): of contracted scenes the cube
-    that is not contracted is the frame's unit."""
-    if "scene_center" not in state.values:
-        return bounded, np.eye(4)
-    norm = kwargs.values.get("contracted_norm", "inf")
+    """The space that the grid lies in, its frame's placement (4, 4), and what is to be said: of contracted
+    scenes the cube that is not contracted is the frame's unit."""
+    if {"scene_center", "scene_radius"}.isdisjoint(state.values):
+        return bounded, np.eye(4), []
+    norm = str(kwargs.values.get("contracted_norm", "inf"))
+    notes = [] if "contracted_norm" in kwargs.values else [NORM]
     spaces = {"inf": contracted_linf, "l2": contracted_l2}
     if norm not in spaces:
-        raise FormatError(f"model_kwargs: 'contracted_norm' should be inf or l2, found {str(norm)[:40]!r}")
+        raise FormatError(f"model_kwargs: 'contracted_norm' should be inf or l2, found {norm[:40]!r}")
     shell = box[3] - 1
     if not 0 < shell <= 1 or not np.allclose(np.abs(box), box[3]):
         raise FormatError(
             f"the box of a contracted scene should be a cube up to 1 to 2, found {box.tolist()}"
         )
+    radius = state.array("scene_radius", 3).astype(np.float64)
+    if not (radius > 0).all():
+        raise FormatError(f"'scene_radius' should be above 0, found {radius.tolist()}")
     placement = np.eye(4)
-    placement[:3, :3] = np.diag(np.broadcast_to(state.array("scene_radius").astype(np.float64), 3))
+    placement[:3, :3] = np.diag(radius)
     placement[:3, 3] = state.array("scene_center", 3)
-    return space_of(spaces[norm], shell=float(shell), contracted_density=1.0), placement
+    return space_of(spaces[norm], shell=float(shell), contracted_density=1.0), placement, notes
 
 
-def cells_of(state: Entries, box: np.ndarray, space) -> OccupancyGrid:
-    """The mask cache, whose samples each stand for a cell around them."""
-    if "mask_cache.mask" not in state.values:
-        return OccupancyGrid.full(box, space=space)
+def cells_of(state: Entries, box: np.ndarray, space) -> tuple[OccupancyGrid, list[str]]:
+    """The mask cache, whose samples each stand for a cell around them, and what is to be said of it."""
+    if "nonempty_mask" in state.values:
+        held = state.array("nonempty_mask", 1, 1, None, None, None)[0, 0] > 0
+        return OccupancyGrid(box, between(held)), [MASK]
+    if {"mask_cache.mask", "mask_cache.xyz2ijk_scale"}.isdisjoint(state.values):
+        return OccupancyGrid.full(box, space=space), []
     mask = state.array("mask_cache.mask", None, None, None) > 0
     scale, shift = (state.array(f"mask_cache.xyz2ijk_{n}", 3).astype(np.float64) for n in ("scale", "shift"))
     if not (scale > 0).all():
         raise FormatError("'mask_cache.xyz2ijk_scale' should be above 0")
     faces = [(-0.5 - shift) / scale, (np.array(mask.shape) - 0.5 - shift) / scale]
-    return OccupancyGrid(np.concatenate(faces), mask, space)
+    return OccupancyGrid(np.concatenate(faces), mask, space), []

@@ -1,10 +1,13 @@
-"""Networks of frequencies: nerf-pytorch's checkpoints (github.com/yenchenlin/nerf-pytorch) and krrish94's
-(github.com/krrish94/nerf-pytorch), after NeRF (Mildenhall et al., ECCV 2020)."""
+"""Networks after NeRF (Mildenhall et al., ECCV 2020): checkpoints of nerf-pytorch
+(github.com/yenchenlin/nerf-pytorch), of krrish94's (github.com/krrish94/nerf-pytorch), and of HashNeRF
+(github.com/yashbhalgat/HashNeRF-pytorch)."""
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 
 from formats.errors import FormatError
 from fusedrf_cli.bridge.importing.parts import (
@@ -20,74 +23,171 @@ from fusedrf_cli.bridge.importing.parts import (
     packed,
     parts_field,
     scattered,
+    trunk_layers,
 )
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsShape
 
 SAMPLES = 256
 """Vertices along the longest side by which rays are sampled."""
+BASE, FINEST = 16, 512  # vertices of HashNeRF's coarsest grid, and of the finest where nothing is said
+HARMONICS = 16  # numbers of a direction in HashNeRF's spherical harmonics
+FINE = "of its coarse and fine networks the fine one is taken"
+NDC = "its frame is that of the normalised device coordinates that it was trained in"
 
 
 def read(checkpoint, box: np.ndarray) -> Imported:
     """The fine network of a checkpoint of nerf-pytorch, or the only one, in a box (6,). Raises
     FormatError."""
-    entries = Entries(checkpoint.entries)
-    fine = entries.values.get("network_fine_state_dict") is not None
-    state = entries.inside("network_fine_state_dict" if fine else "network_fn_state_dict")
+    state, notes = network_of(checkpoint, "network_fn_state_dict", "network_fine_state_dict")
+    check_biases(state)
     layers = state.layers("pts_linears.")
-    frequencies = frequencies_of(layers[0][0].shape[1])
+    encoding = encoding_of(layers[0][0].shape[1])
     if "output_linear.weight" in state.values:
-        weight, bias = state.layer("output_linear")
-        rows = [3, 0, 1, 2]  # a fifth, where there is one, is unused
-        out = weight[rows], None if bias is None else bias[rows]
-        sigma, sections = skipping([*layers, out], frequencies, hidden_first=False)
-        basis = np.zeros((3, 1, sigma["outputs"]))
-        basis[np.arange(3), 0, 1 + np.arange(3)] = 1 / Y0
-        rgb, colours = {"part": "sh_basis", "coefficients": 1}, {"rgb_basis": basis}
-    else:
-        out = stacked(state.layer("alpha_linear"), state.layer("feature_linear"))
-        sigma, sections = skipping([*layers, out], frequencies, hidden_first=False)
-        order, columns = seen(sigma["outputs"], len(out[0]) - 1, state.layer("views_linears.0"))
-        network = [*state.layers("views_linears."), state.layer("rgb_linear")]
-        rgb, colours = colour_network(network, order, columns)
-    notes = [] if not fine else ["of its coarse and fine networks the fine one is taken"]
-    return finished(frequencies, sigma, rgb, sections | colours, box, notes)
+        sigma, rgb, sections = without_directions(layers, state.layer("output_linear"), encoding, False)
+        return finished(encoding, sigma, rgb, sections, box, notes)
+    feature = state.layer("feature_linear")
+    out = stacked(state.layer("alpha_linear"), feature)
+    sigma, sections = skipping([*layers, out], encoding["count"], hidden_first=False)
+    network, count = [*state.layers("views_linears."), state.layer("rgb_linear")], len(feature[0])
+    order, columns = seen(sigma["outputs"], count, network[0][0].shape[1] - count)
+    columns = np.concatenate([order.at("features")[1:], columns])
+    rgb, colours = colour_network(network, order, columns)
+    return finished(encoding, sigma, rgb, sections | colours, box, notes)
 
 
 def read_krrish(checkpoint, box: np.ndarray) -> Imported:
-    """The same of krrish94's, whose features are rectified before the direction joins them."""
-    entries = Entries(checkpoint.entries)
-    fine = entries.values.get("model_fine_state_dict") is not None
-    state = entries.inside("model_fine_state_dict" if fine else "model_coarse_state_dict")
-    first, *layers = [state.layer("layer1"), *state.layers("layers_xyz.")]
-    frequencies, hidden = frequencies_of(first[0].shape[1]), len(layers[-1][0])
+    """The same of krrish94's, whose features are rectified before the direction joins them, and whose
+    encodings may leave out the point and the direction themselves."""
+    check_sampling(checkpoint)
+    state, notes = network_of(checkpoint, "model_coarse_state_dict", "model_fine_state_dict")
+    check_biases(state)
+    first, layers = state.layer("layer1"), state.layers("layers_xyz.")
+    inputs, hidden = first[0].shape[1], len(layers[-1][0])
     layers[0] = joined(first, layers[0])  # the first has no activation
+    if inputs and inputs % 6 == 0:
+        layers, inputs = with_point(layers, inputs), inputs + 3
+    encoding = encoding_of(inputs)
+    if "fc_out.weight" in state.values:
+        sigma, rgb, sections = without_directions(layers, state.layer("fc_out"), encoding, True)
+        return finished(encoding, sigma, rgb, sections, box, notes)
     out = stacked(state.layer("fc_alpha"), (np.eye(hidden), None))
-    sigma, sections = skipping([*layers, out], frequencies, hidden_first=True)
-    features, first = state.layer("fc_feat"), state.layer("layers_dir.0")
-    order, columns = seen(
-        sigma["outputs"], hidden, (np.zeros((1, first[0].shape[1] - len(features[0]) + hidden)), None)
-    )
-    directions = len(columns) - hidden
+    sigma, sections = skipping([*layers, out], encoding["count"], hidden_first=True)
+    (feature, bias), (weight, own), *others = state.layer("fc_feat"), *state.layers("layers_dir.")
+    check_layers([(feature, bias), (weight[:, : len(feature)], own)], hidden)
+    count, directions = len(feature), weight.shape[1] - len(feature)
+    order, columns = seen(sigma["outputs"], hidden, directions)
     # A direction e passes a rectified layer as max(0, e) and max(0, -e).
-    made, count = np.zeros((len(features[0]) + 2 * directions, len(columns))), len(features[0])
-    made[:count, :hidden] = features[0]
-    made[count : count + directions, hidden:] = np.eye(directions)
-    made[count + directions :, hidden:] = -np.eye(directions)
-    bias = np.zeros(len(made))
-    bias[:count] = 0 if features[1] is None else features[1]
-    second = np.concatenate([first[0], -first[0][:, count:]], 1)
-    network = [(made, bias), (second, first[1]), *state.layers("layers_dir.")[1:], state.layer("fc_rgb")]
+    made, made_bias = (
+        np.zeros((count + 2 * directions, hidden + directions)),
+        np.zeros(count + 2 * directions),
+    )
+    made[:count, : feature.shape[1]] = feature
+    made[count:, hidden:] = np.concatenate([np.eye(directions), -np.eye(directions)])
+    made_bias[:count] = 0 if bias is None else bias
+    second = np.concatenate([weight, -weight[:, count:]], 1), own
+    network = [(made, made_bias), second, *others, state.layer("fc_rgb")]
+    columns = np.concatenate([order.at("features")[1:], columns])
     rgb, colours = colour_network(network, order, columns)
-    notes = [] if not fine else ["of its coarse and fine networks the fine one is taken"]
-    return finished(frequencies, sigma, rgb, sections | colours, box, notes)
+    return finished(encoding, sigma, rgb, sections | colours, box, notes)
+
+
+def read_hashed(checkpoint, box: np.ndarray) -> Imported:
+    """The same of HashNeRF's small networks, which read a hash grid over the box."""
+    state, notes = network_of(checkpoint, "network_fn_state_dict", "network_fine_state_dict")
+    tables = Entries(checkpoint.entries).inside("embed_fn_state_dict")
+    names = [f"embeddings.{level}.weight" for level in range(max(len(tables.values), 1))]
+    first = tables.array(names[0], None, None)
+    rows = np.concatenate([tables.array(name, *first.shape) for name in names])
+    settings = Entries(checkpoint.beside.get("args.txt", {}))
+    finest = settings.whole("finest_res", 1, 1 << 20, FINEST)
+    if "finest_res" not in settings.values:
+        notes.append(f"nothing beside it says its 'finest_res', for which {FINEST} is taken")
+    if np.array_equal(box, hashed_box(checkpoint)):
+        notes.append("its box is that of args.txt, which has four digits; --aabb takes one with more")
+    levels = hashed_levels(len(names), len(first), finest)
+    encoding = {"part": "hash_grid", "features": first.shape[1], "levels": levels}
+    trunk = state.layers("sigma_net.")
+    sigma, sections = trunk_layers(trunk, eight(len(names) * first.shape[1]), activation="relu")
+    network, count = state.layers("color_net."), len(trunk[-1][0]) - 1
+    order, columns = seen(sigma["outputs"], count, network[0][0].shape[1] - count)
+    columns = np.concatenate([columns, order.at("features")[1:]])
+    rgb, colours = colour_network(network, order, columns)
+    return finished(encoding, sigma, rgb, {"density_rows": rows} | sections | colours, box, notes)
+
+
+def hashed_levels(count: int, rows: int, finest: int) -> list[dict[str, Any]]:
+    """The levels of HashNeRF's grid, whose vertices are hashed on all of them. Their numbers are computed in
+    float32, as there: the finest may have one less than was asked for."""
+    base, last = torch.tensor(BASE), torch.tensor(finest)
+    growth = torch.exp((torch.log(last) - torch.log(base)) / max(count - 1, 1))
+    sides = [int(torch.floor(base * growth**level)) for level in range(count)]
+    return [
+        {"scale": float(side), "side": side + 2, "rows": rows, "hashed": True, "offset": 0.0}
+        for side in sides
+    ]
+
+
+def hashed_box(checkpoint) -> np.ndarray | None:
+    """The box (6,) of HashNeRF's grid that its run's settings state, with four digits."""
+    stated = str(checkpoint.beside.get("args.txt", {}).get("bounding_box"))
+    numbers = re.findall(r"[-+.\de]+", " ".join(re.findall(r"tensor\(\[([^]]*)\]", stated)))
+    return np.array(numbers, np.float64) if len(numbers) == 6 else None
+
+
+# -- what they have in common --------------------------------------------------------------------------------
+
+
+def network_of(checkpoint, coarse: str, fine: str) -> tuple[Entries, list[str]]:
+    """The state of the fine network, or of the only one, and what is to be said of it."""
+    entries, beside = Entries(checkpoint.entries), checkpoint.beside
+    args, dataset = beside.get("args.txt", {}), beside.get("config.yml", {}).get("dataset")
+    notes = [FINE] if entries.values.get(fine) else []
+    no_ndc = dataset.get("no_ndc") if isinstance(dataset, dict) else args.get("no_ndc")
+    if no_ndc is False and args.get("dataset_type", "llff") == "llff":
+        notes.append(NDC)
+    return entries.inside(fine if entries.values.get(fine) else coarse), notes
+
+
+def check_biases(state: Entries) -> None:
+    """Raise FormatError where a layer has no bias."""
+    for name in state.values:
+        if str(name).endswith(".weight"):
+            state.get(f"{str(name).removesuffix('weight')}bias")
+
+
+def check_sampling(checkpoint) -> None:
+    """Refuse encodings by evenly spaced frequencies, which only the settings of krrish94's runs tell."""
+    models = checkpoint.beside.get("config.yml", {}).get("models")
+    model = models.get("coarse") if isinstance(models, dict) else None
+    for name in ("xyz", "dir") if isinstance(model, dict) else ():
+        count = model.get(f"num_encoding_fn_{name}", 3)
+        if model.get(f"log_sampling_{name}") is False and not (isinstance(count, int) and count < 3):
+            raise FormatError(
+                f"config.yml beside it says 'log_sampling_{name}: false', and frequencies that are evenly "
+                "spaced are not taken over; train it with 'true'"
+            )
+
+
+def without_directions(
+    layers: Sequence[Layer], out: Layer, encoding: dict[str, Any], hidden_first: bool
+) -> tuple[dict, dict, dict[str, np.ndarray]]:
+    """The entries and the sections of a trunk that makes three logits and the density, in this order."""
+    weight, bias = out
+    if len(weight) not in (4, 5):
+        raise FormatError(f"a network without directions should make 4 or 5 numbers, found {len(weight)}")
+    rows = [3, 0, 1, 2]  # a fifth, where there is one, is unused
+    out = weight[rows], None if bias is None else bias[rows]
+    sigma, sections = skipping([*layers, out], encoding["count"], hidden_first)
+    basis = np.zeros((3, 1, sigma["outputs"]))
+    basis[np.arange(3), 0, 1 + np.arange(3)] = 1 / Y0
+    return sigma, {"part": "sh_basis", "coefficients": 1}, sections | {"rgb_basis": basis}
 
 
 def finished(
-    frequencies: int, sigma: dict, rgb: dict, values: dict, box: np.ndarray, notes: Sequence[str]
+    encoding: dict[str, Any], sigma: dict, rgb: dict, values: dict, box: np.ndarray, notes: Sequence[str]
 ) -> Imported:
     """The import of networks in a box."""
-    encoding = {"part": "frequencies", "count": frequencies, "frame": True}
     shape = PartsShape(encoding, {"part": "trunk_features"}, sigma | {"activation": "relu"}, rgb)
     sides = box[3:] - box[:3]
     resolution = np.maximum(2, np.rint(SAMPLES * sides / sides.max())).astype(int)
@@ -95,27 +195,52 @@ def finished(
     return Imported([ImportedNode(field)], notes)
 
 
+def encoding_of(inputs: int) -> dict[str, Any]:
+    """The entry of an encoding of the point by so many numbers."""
+    return {"part": "frequencies", "count": frequencies_of(inputs), "frame": True}
+
+
 def frequencies_of(inputs: int) -> int:
     """Of an encoding of so many numbers: three, and six for each."""
     count, rest = divmod(inputs - 3, 6)
     if rest or not 0 <= count <= 24:
         raise FormatError(
-            f"a network of points should read 3 numbers and 6 for each frequency, found {inputs}"
+            "a network should read 3 numbers of a point or of a direction, and 6 for each frequency, found "
+            f"{inputs}"
         )
     return count
 
 
-def seen(width: int, features: int, layer: Layer) -> tuple[ColourInput, np.ndarray]:
-    """The input of a colour network of the trunk's outputs but for the first, and of the direction and its
-    sines and cosines, frequency by frequency; as many as its first layer reads."""
-    frequencies = frequencies_of(layer[0].shape[1] - features)
-    order = ColourInput(1 + features, width, frequencies)
+def seen(width: int, features: int, directions: int) -> tuple[ColourInput, np.ndarray]:
+    """The input of a colour network of the trunk's outputs, a number and then features, and where in it the
+    so many numbers of the direction lie: none, harmonics, or itself, which may be left out, and its sines and
+    cosines, frequency by frequency."""
+    if directions == HARMONICS:
+        order = ColourInput(1 + features, width, harmonics=True)
+        return order, order.at("direction")
+    bare = directions % 6 == 0
+    frequencies = frequencies_of(directions + 3 * bare)
+    order = ColourInput(1 + features, width, frequencies, alone=True)
     waves = order.waves("direction", frequencies, by_level=True)
-    return order, np.concatenate([order.at("features")[1:], order.at("direction"), waves])
+    return order, waves if bare else np.concatenate([order.at("direction"), waves])
+
+
+def with_point(layers: Sequence[Layer], inputs: int) -> list[Layer]:
+    """Layers that read the sines and cosines of a point, behind what the layer before made, as ones that read
+    it itself before them."""
+    widened = []
+    for i, (weight, bias) in enumerate(layers):
+        made = len(layers[i - 1][0]) if i else 0
+        reads = weight.shape[1] == made + inputs
+        widened.append((np.insert(weight, [made] * 3, 0, 1) if reads else weight, bias))
+    return widened
 
 
 def stacked(*layers: Layer) -> Layer:
     """Layers that read the same, as one."""
+    if len({weight.shape[1] for weight, _ in layers}) > 1:
+        found = " and ".join(str(weight.shape[1]) for weight, _ in layers)
+        raise FormatError(f"layers behind the same one should read as many numbers, found {found}")
     weights = np.concatenate([weight for weight, _ in layers])
     biases = [np.zeros(len(weight)) if bias is None else bias for weight, bias in layers]
     return weights, np.concatenate(biases)
@@ -134,18 +259,18 @@ def joined(first: Layer, second: Layer) -> Layer:
 def skipping(
     layers: Sequence[Layer], frequencies: int, hidden_first: bool
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The entry and the sections of a trunk of which one layer may read the encoded point again, before or
-    behind what the layer before it made."""
+    """The entry and the sections of a trunk of which layers may read the encoded point again, before or
+    behind what the layer before them made."""
     inputs, layers, again = 3 + 6 * frequencies, list(layers), {}
+    widths = [len(weight) for weight, _ in layers]
     for i in range(1, len(layers)):
         weight, bias = layers[i]
-        made = len(layers[i - 1][0])
-        if weight.shape[1] == made + inputs and weight.shape[1] != made:
-            if again:
-                raise FormatError("more than one layer reads the point again, which is not taken over")
-            parts = np.split(weight, [made if hidden_first else inputs], 1)
-            own, point = parts if hidden_first else reversed(parts)
-            layers[i], again = (own, bias), {i: point}
+        if weight.shape[1] == widths[i - 1] + inputs:
+            parts = np.split(weight, [widths[i - 1] if hidden_first else inputs], 1)
+            own, again[i] = parts if hidden_first else reversed(parts)
+            layers[i] = own, bias
+    if len(again) > 1:
+        carry(layers, again, inputs)
     hidden, width = check_layers(layers, inputs), eight(inputs)
     entry = {
         "part": "trunk",
@@ -160,3 +285,22 @@ def skipping(
     for i, point in again.items():
         entry["skip"], sections["sigma_again"] = i, point.T
     return entry, sections
+
+
+def carry(layers: list[Layer], again: dict[int, np.ndarray], inputs: int) -> None:
+    """Make only the first of the layers that read the encoded point `again` do so: from it to the last, units
+    more hand on max(0, x) and max(0, -x) of each of its numbers x."""
+    both = np.concatenate([np.eye(inputs), -np.eye(inputs)])
+    first, last = min(again), max(again)
+    for i in range(first, last + 1):
+        weight, bias = layers[i]
+        bias = np.zeros(len(weight)) if bias is None else bias
+        if i > first:
+            came = again.pop(i) @ both.T if i in again else np.zeros((len(weight), 2 * inputs))
+            weight = np.concatenate([weight, came], 1)
+        if i < last:
+            handed = np.eye(2 * inputs, weight.shape[1], weight.shape[1] - 2 * inputs) * (i > first)
+            weight = np.concatenate([weight, handed])
+            bias = np.concatenate([bias, np.zeros(2 * inputs)])
+        layers[i] = weight, bias
+    again[first] = np.concatenate([again[first], both])

@@ -252,7 +252,11 @@ def by_of(neurons: int) -> int:
 
 def halves(state: Entries, name: str) -> np.ndarray:
     """Numbers as they are computed with."""
-    return state.array(name, None).astype(np.float16).astype(np.float32)
+    with np.errstate(over="ignore"):
+        values = state.array(name, None).astype(np.float16).astype(np.float32)
+    if not np.isfinite(values).all():
+        raise FormatError(f"'{name}' holds numbers beyond those of float16, in which it is computed")
+    return values
 
 
 # -- where it lies -------------------------------------------------------------------------------------------

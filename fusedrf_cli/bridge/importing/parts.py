@@ -12,6 +12,8 @@ import torch
 from formats.errors import FormatError
 from fusedrf_cli.engine.decoders import mlp
 from fusedrf_cli.engine.decoders.sh_mlp import HARMONICS
+from fusedrf_cli.engine.fields.base import check_samples, sampling_step
+from fusedrf_cli.engine.fields.box import checked_box, whole_numbers
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsField, PartsShape
 
@@ -105,13 +107,23 @@ class Entries:
 
     def layers(self, prefix: str) -> list[Layer]:
         """The dense layers of a network whose names begin so: `<prefix><numbers>.weight` and, if there are
-        any, `.bias`, in the order of their numbers: 0, 2.0, 3."""
+        any, `.bias`, in the order of their numbers: 0, 1, 2; with activations between them 0, 2, 4; or, where
+        they are nested as DVGO's, 0, 2.0, 3."""
         found = re.compile(re.escape(prefix) + r"(\d{1,3}(?:\.\d{1,3})*)\.weight")
         middles = [match[1] for name in self.values if (match := found.fullmatch(str(name)))]
         if not middles:
             raise FormatError(f"{self.where}'{prefix}0.weight' is missing")
         ordered = sorted(middles, key=lambda middle: [int(n) for n in middle.split(".")])
-        return [self.layer(prefix + middle) for middle in ordered]
+        numbers, count = [int(middle.split(".")[0]) for middle in ordered], len(ordered)
+        nested = any("." in middle for middle in ordered)
+        if numbers not in (
+            list(range(count)), list(range(0, 2 * count, 2)), [0, *range(2, count + 1)] if nested else [],
+        ):  # fmt: skip
+            raise FormatError(f"{self.where}'{prefix}*' has layers {', '.join(ordered)}: one is missing")
+        layers = [self.layer(prefix + middle) for middle in ordered]
+        if len({bias is None for _, bias in layers}) > 1:
+            raise FormatError(f"{self.where}'{prefix}*' has biases of some layers only: one is missing")
+        return layers
 
     def layer(self, name: str) -> Layer:
         """One dense layer."""
@@ -132,9 +144,17 @@ def parts_field(
     shift: float = 0.0,
     occupancy: OccupancyGrid | None = None,
 ) -> PartsField:
-    """A field of these numbers by the names of its sections; where one has fewer, the others are 0."""
-    resolution = tuple(int(n) for n in resolution)
-    field = PartsField(shape, np.asarray(box, np.float64), resolution, scale, shift, occupancy=occupancy)
+    """A field of these numbers by the names of its sections; where one has fewer, the others are 0. Raises
+    ValueError for what a bundle may not say either."""
+    resolution = whole_numbers([int(n) for n in resolution], 2, "texels per axis")
+    if not (0 < scale < np.inf and np.isfinite(shift)):
+        raise FormatError(
+            f"the density's scale should be above 0 and its shift finite, found {scale}, {shift}"
+        )
+    field = PartsField(
+        shape, checked_box(np.asarray(box).tolist(), "the box"), resolution, scale, shift, occupancy=occupancy
+    )
+    check_samples(field.occupancy.most_samples(sampling_step(field)), "the field")
     sections = field.sections()
     if values.keys() != sections.keys():
         raise ValueError(f"the sections are {sorted(sections)}, found {sorted(values)}")
@@ -176,10 +196,18 @@ class ColourInput:
     frequencies: int = 0
     harmonics: bool = False
     point: bool = False
+    alone: bool = False
+    """Whether only the direction is encoded by frequencies."""
 
     @property
     def core(self) -> int:
-        return self.width + (HARMONICS if self.harmonics else 3) + 3 * self.point
+        waves = 6 * self.frequencies * self.alone
+        return self.width + (HARMONICS if self.harmonics else 3) + waves + 3 * self.point
+
+    @property
+    def direction(self) -> str:
+        """As the network's options have it."""
+        return "harmonics" if self.harmonics else ("waves" if self.alone else "raw")
 
     def at(self, which: str) -> np.ndarray:
         """The rows of the features, the direction or the point."""
@@ -193,8 +221,9 @@ class ColourInput:
         """The rows of sines and cosines of the features, the direction or the point: all sines, dimension by
         dimension, then all cosines; or by_level, sines and cosines of all dimensions for each level."""
         dims, levels = self.at(which)[:, None], np.arange(frequencies)[None]
-        sines = dims + self.core * (1 + levels)
-        cosines = dims + self.core * (1 + self.frequencies + levels)
+        apart = 3 if self.alone else self.core
+        sines = dims + apart * (1 + levels)
+        cosines = dims + apart * (1 + self.frequencies + levels)
         if by_level:
             return np.stack([sines, cosines], 1).transpose(2, 1, 0).reshape(-1)
         return np.concatenate([sines.reshape(-1), cosines.reshape(-1)])
@@ -212,7 +241,7 @@ def colour_network(
     hidden = check_layers(layers, len(columns), 3)
     entry = {
         "part": "mlp", "rows": rows, "hidden": hidden, "layers": len(layers) - 1,
-        "frequencies": order.frequencies, "direction": "harmonics" if order.harmonics else "raw",
+        "frequencies": order.frequencies, "direction": order.direction,
         "point": order.point, "diffuse": diffuse,
     }  # fmt: skip
     inputs = mlp.layer_shapes(order.width, 0, hidden, len(layers) - 1, order.frequencies, entry["direction"],

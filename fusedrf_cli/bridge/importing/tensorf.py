@@ -1,5 +1,5 @@
-"""TensoRF's checkpoints (Chen et al., ECCV 2022; github.com/apchenstu/TensoRF), of TensorVMSplit and of
-TensorCP."""
+"""TensoRF's checkpoints (Chen et al., ECCV 2022; github.com/apchenstu/TensoRF), of TensorVMSplit, TensorCP
+and TensorVM."""
 
 import numpy as np
 
@@ -15,16 +15,19 @@ from fusedrf_cli.bridge.importing.parts import (
     parts_field,
     ranks_filled,
 )
+from fusedrf_cli.engine.fields.box import checked_box
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsShape
 
 MAX_FREQUENCIES = 16
+NDC = "its rays go from 0 to 1, as in normalised device coordinates, which are its frame if it was trained so"
 
 
 def read(checkpoint) -> Imported:
     """The field of a checkpoint. Raises FormatError."""
     entries = Entries(checkpoint.entries)
-    kwargs, state = entries.inside("kwargs"), entries.inside("state_dict")
+    kwargs = entries.inside("kwargs")
+    state = split(entries.inside("state_dict"), kwargs)
     planes = any(name.startswith("density_plane.") for name in state.values)
     density, resolution, _ = factors(state, "density", planes)
     colour, colour_resolution, ranks = factors(state, "app", planes)
@@ -49,7 +52,23 @@ def read(checkpoint) -> Imported:
     shift = kwargs.number("density_shift", -10.0) if act == "softplus" else 0.0
     scale = kwargs.number("distance_scale", 25.0)
     field = parts_field(shape, box, resolution, values, scale, shift, cells_of(entries, box))
-    return Imported([ImportedNode(field)])
+    in_ndc = kwargs.values.get("near_far") in ([0, 1], (0, 1))
+    return Imported([ImportedNode(field)], [NDC] if in_ndc else [])
+
+
+def split(state: Entries, kwargs: Entries) -> Entries:
+    """A state by the names of TensorVMSplit: TensorVM has planes and lines of colour and density in one
+    array, those of density last."""
+    if "plane_coef" not in state.values:
+        return state
+    planes, lines = state.array("plane_coef", 3, None, None, None), state.array("line_coef", 3, None, None, 1)
+    first = planes.shape[1] - kwargs.whole("density_n_comp", 1, max(planes.shape[1] - 1, 1))
+    parts = {"plane": planes, "line": lines}
+    named = {f"app_{part}.{i}": found[i : i + 1, :first] for part, found in parts.items() for i in range(3)}
+    named |= {
+        f"density_{part}.{i}": found[i : i + 1, first:] for part, found in parts.items() for i in range(3)
+    }
+    return Entries(state.values | named, state.where)
 
 
 def factors(state: Entries, which: str, planes: bool) -> tuple[dict[str, np.ndarray], tuple, list[int]]:
@@ -80,7 +99,7 @@ def factors(state: Entries, which: str, planes: bool) -> tuple[dict[str, np.ndar
 
 def shading_of(kwargs: Entries, state: Entries, basis: np.ndarray) -> tuple[dict, dict[str, np.ndarray], str]:
     """The entry of the colour's decoder, its sections, and the activation of colours."""
-    mode, count = kwargs.get("shadingMode"), len(basis)
+    mode, count = kwargs.values.get("shadingMode", "MLP_PE"), len(basis)
     if mode == "SH":
         if count != 27:
             raise FormatError(f"'basis_mat.weight' should have 27 rows for SH shading, found {count}")
@@ -96,7 +115,8 @@ def shading_of(kwargs: Entries, state: Entries, basis: np.ndarray) -> tuple[dict
     view = kwargs.whole("view_pe", 0, MAX_FREQUENCIES, 6)
     features = kwargs.whole("fea_pe", 0, MAX_FREQUENCIES, 6) if mode == "MLP_Fea" else 0
     points = kwargs.whole("pos_pe", 0, MAX_FREQUENCIES, 6) if mode == "MLP_PE" else 0
-    order = ColourInput(count, count, max(view, features, points), point=mode == "MLP_PE")
+    frequencies, alone = max(view, features, points), not features and not points
+    order = ColourInput(count, count, frequencies, point=mode == "MLP_PE", alone=alone)
     layers = state.layers("renderModule.mlp.")
     columns = [order.at("features"), order.at("direction")]
     if mode == "MLP_PE":
@@ -113,9 +133,9 @@ def shading_of(kwargs: Entries, state: Entries, basis: np.ndarray) -> tuple[dict
 
 def cells_of(entries: Entries, box: np.ndarray) -> OccupancyGrid:
     """The alpha mask: a point counts where any of the eight samples around it is occupied."""
-    if "alphaMask.shape" not in entries.values:
+    if {"alphaMask.shape", "alphaMask.mask", "alphaMask.aabb"}.isdisjoint(entries.values):
         return OccupancyGrid.full(box)
-    shape = [int(n) for n in np.asarray(entries.get("alphaMask.shape")).reshape(-1)][-3:]
+    shape = [int(n) for n in entries.array("alphaMask.shape", None)[-3:]]
     bits = entries.get("alphaMask.mask")
     bits = bits.array() if hasattr(bits, "array") else np.asarray(bits)
     if (
@@ -126,8 +146,12 @@ def cells_of(entries: Entries, box: np.ndarray) -> OccupancyGrid:
     ):
         raise FormatError(f"'alphaMask.mask' should be the bits of a grid, of 'alphaMask.shape' {shape}")
     samples = np.unpackbits(bits.reshape(-1), count=int(np.prod(shape))).reshape(shape).astype(bool).T
-    mask_box = entries.array("alphaMask.aabb", 2, 3).astype(np.float64).reshape(6)
-    return OccupancyGrid(mask_box, between(samples))
+    mask_box = entries.array("alphaMask.aabb", 2, 3).astype(np.float64)
+    if (mask_box[0] > box[:3]).any() or (mask_box[1] < box[3:]).any():
+        # samples around those of the mask are 0, and a point may lie between the two
+        samples, cell = np.pad(samples, 1), (mask_box[1] - mask_box[0]) / (np.array(samples.shape) - 1)
+        mask_box = mask_box + [-cell, cell]
+    return OccupancyGrid(checked_box(mask_box.reshape(6).tolist(), "'alphaMask.aabb'"), between(samples))
 
 
 def between(samples: np.ndarray) -> np.ndarray:

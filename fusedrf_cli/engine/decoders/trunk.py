@@ -16,14 +16,7 @@ from fusedrf_cli.engine.decoders import activations
 from fusedrf_cli.engine.decoders.activations import activated, activated_slope
 from fusedrf_cli.engine.fields.box import ParameterBlock
 from fusedrf_cli.engine.fields.part_options import Activation, Layers, Limits, Width
-from fusedrf_cli.engine.kernels.primitives import (
-    add_scaled,
-    dense,
-    dense_backward,
-    dot,
-    rectify,
-    scatter,
-)
+from fusedrf_cli.engine.kernels.networks import network, network_backward
 
 
 class Options(msgspec.Struct, forbid_unknown_fields=True):
@@ -45,8 +38,7 @@ class Options(msgspec.Struct, forbid_unknown_fields=True):
 class Arrays(NamedTuple):
     """What the functions read beside `params`."""
 
-    layers: object  # (LAYERS + 1,) int64, where a layer's (inputs, outputs) begin, and behind them its bias
-    again: object  # int64, where the (WIDTH, HIDDEN) begin by which the layer SKIP reads the features
+    layers: object  # int64, where each layer begins, as kernels/networks.py has them
     activation: object  # (2,) float, scale (1/length) and shift
 
 
@@ -56,8 +48,8 @@ def sizes(
     """See decoders; scratch holds features, what the layers made, outputs, and the gradients of features, of
     two layers and of the outputs, these 0 between samples. skip 0: none."""
     rooms = {
-        "X": width, "H": layers * hidden, "OUT": outputs, "D_X": width, "D_H": hidden, "D_BEFORE": hidden,
-        "D_OUT": outputs, "D_AGAIN": width if skip else 0,
+        "X": width, "H": layers * hidden, "OUT": outputs, "D_H": hidden, "D_BEFORE": hidden,
+        "D_OUT": outputs, "D_X": width * (2 if skip else 1),
     }  # fmt: skip
     starts = np.cumsum([0, *rooms.values()]).tolist()
     return {
@@ -79,9 +71,9 @@ def sections(
     return blocks + again
 
 
-def arrays(field, starts: np.ndarray, layers: int = 1, skip: int = 0, **options) -> Arrays:
+def arrays(field, starts: np.ndarray, **options) -> Arrays:
     """See decoders."""
-    return Arrays(starts[: layers + 1], np.int64(starts[-1] if skip else 0), field.activation)
+    return Arrays(starts, field.activation)
 
 
 def reference(
@@ -116,20 +108,11 @@ def bound(
 
 def outputs_at(field, cell, scratch):
     """Where in scratch all outputs at a point are, computed anew."""
-    x, h, out = np.uint64(AT + X), np.uint64(AT + H), np.uint64(AT + OUT)
+    x, out = np.uint64(AT + X), np.uint64(AT + OUT)
     features_forward(field, cell, scratch, scratch, AT + X)
-    dense(WIDTH, HIDDEN, field.params, np.uint64(field.layers[0]), scratch, x, scratch, h)
-    rectify(HIDDEN, scratch, h)
-    for layer in range(1, LAYERS):
-        above = h + np.uint64(HIDDEN)
-        dense(HIDDEN, HIDDEN, field.params, np.uint64(field.layers[layer]), scratch, h, scratch, above)
-        h = above
-        if SKIP > 0 and layer == SKIP:
-            for i in range(np.uint64(WIDTH)):
-                row = np.uint64(field.again) + i * np.uint64(HIDDEN)
-                add_scaled(HIDDEN, scratch, h, scratch[x + i], field.params, row)
-        rectify(HIDDEN, scratch, h)
-    dense(HIDDEN, OUTPUTS, field.params, np.uint64(field.layers[LAYERS]), scratch, h, scratch, out)
+    network(
+        WIDTH, HIDDEN, LAYERS, SKIP, OUTPUTS, field.params, field.layers, scratch, x, np.uint64(AT + H), out
+    )
     return out
 
 
@@ -147,34 +130,13 @@ def forward(field, cell, scratch):
 def backward(field, cell, pre, d_sigma, scratch, grad):
     """See decoders; with what colour sent back to the outputs."""
     outputs_at(field, cell, scratch)
-    x, h, params = np.uint64(AT + X), np.uint64(AT + H + (LAYERS - 1) * HIDDEN), field.params
-    d_x, d_h, d_before = np.uint64(AT + D_X), np.uint64(AT + D_H), np.uint64(AT + D_BEFORE)
     d_out = pending_at(scratch)
     scratch[d_out] += d_sigma * field.activation[0] * activated_slope(pre + field.activation[1])
-    layer = np.uint64(field.layers[LAYERS])
-    dense_backward(HIDDEN, OUTPUTS, params, layer, scratch, h, True, scratch, d_out, scratch, d_h, grad)
-    for back in range(1, LAYERS):
-        below, layer = h - np.uint64(HIDDEN), np.uint64(field.layers[LAYERS - back])
-        dense_backward(
-            HIDDEN, HIDDEN, params, layer, scratch, below, True, scratch, d_h, scratch, d_before, grad
-        )
-        if SKIP > 0 and LAYERS - back == SKIP:
-            again_backward(field, x, d_h, scratch, grad)
-        h, d_h, d_before = below, d_before, d_h
-    dense_backward(
-        WIDTH, HIDDEN, params, np.uint64(field.layers[0]), scratch, x, False, scratch, d_h, scratch, d_x, grad
-    )
-    if SKIP > 0:
-        for i in range(np.uint64(WIDTH)):
-            scratch[d_x + i] += scratch[np.uint64(AT + D_AGAIN) + i]
+    network_backward(
+        WIDTH, HIDDEN, LAYERS, SKIP, OUTPUTS, field.params, field.layers, scratch, np.uint64(AT + X),
+        np.uint64(AT + H), scratch, d_out, np.uint64(AT + D_H), np.uint64(AT + D_BEFORE), np.uint64(AT + D_X),
+        grad,
+    )  # fmt: skip
     features_backward(field, cell, scratch, AT + D_X, scratch, grad)
     for r in range(np.uint64(OUTPUTS)):
         scratch[d_out + r] = 0
-
-
-def again_backward(field, x, d_h, scratch, grad):
-    """What the layer that reads the features x again sends back to them, into scratch[AT + D_AGAIN:]."""
-    for i in range(np.uint64(WIDTH)):
-        row = np.uint64(field.again) + i * np.uint64(HIDDEN)
-        scatter(HIDDEN, grad, row, scratch[x + i], scratch, d_h)
-        scratch[np.uint64(AT + D_AGAIN) + i] = dot(HIDDEN, field.params, row, scratch, d_h)

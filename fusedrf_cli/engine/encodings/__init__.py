@@ -46,7 +46,8 @@ For Python, with `options` what a field's shape says of the encoding:
                                what the slot that it reads hands on (kernels/assembled.py), or None
     bound(sections, read, **options)
                                (WIDTH,) float64 the largest magnitude that each feature can reach; of fields
-                               over a box
+                               over a box; or bound_within(reach, sections, **options) of one whose points
+                               are those of the frame, and no coordinate of the box is beyond reach
     logits_reference(field, sections, unit, **options), logits_bound(sections, **options)
                                the same of `logits`: (N, 3), and one magnitude
 """

@@ -37,8 +37,8 @@ def reference(
 
 
 def bound(sections: dict, read: None, count: int, frame: bool = False) -> torch.Tensor:
-    """See encodings; boxes that a frame is encoded in are no larger than this."""
-    return torch.full((sizes(count)["WIDTH"],), 1e4 if frame else 1.0, dtype=torch.float64)
+    """See encodings; of a point of the cube."""
+    return torch.ones(sizes(count)["WIDTH"], dtype=torch.float64)
 
 
 # -- compiled ------------------------------------------------------------------------------------------------

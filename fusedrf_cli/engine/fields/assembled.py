@@ -204,18 +204,30 @@ class AssembledField(Assembled, BoxField):
     def located(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """See Assembled: in the unit cube of the box, where a cell is occupied."""
         box = exact(self.box, points.device)
-        unit = ((points - box[:3]) / (box[3:] - box[:3])).to(self.params.dtype)
-        return unit, cell_at(self.occupancy, points)[1]
+        unit = (points - box[:3]) / (box[3:] - box[:3])
+        inside = ((unit - 0.5).abs() <= 0.5 + 1e-9).all(1)  # as kernels/assembled.py's `steps_at`
+        return unit.to(self.params.dtype), cell_at(self.occupancy, points)[1] & inside
 
     def check_answers(self) -> None:
         """See BoxField."""
         sections = self.slot_sections()
         density, colour, sigma, rgb = self.slots.values()
-        features = density.module.bound(sections["density"], None, **density.options)
+        features = self.features_bound(density, sections["density"], None)
         largest, outputs = sigma.module.bound(self, sections["sigma"], features, **sigma.options)
         self.check_density(largest)
-        features = colour.module.bound(sections["colour"], outputs, **colour.options)
+        features = self.features_bound(colour, sections["colour"], outputs)
         logit = rgb.module.bound(self, sections["rgb"], features, **rgb.options)
         if hasattr(density.module, "logits_bound"):
             logit += density.module.logits_bound(sections["density"], **density.options)
         self.check_logit(logit)
+
+    def features_bound(self, slot: Slot, sections: dict, read: torch.Tensor | None) -> torch.Tensor:
+        """`bound` of the encoding of a slot, which reads what is at most `read`; where it begins with the
+        point as it is, that lies in the box."""
+        reach = float(np.abs(self.box).max())
+        if hasattr(slot.module, "bound_within"):
+            return slot.module.bound_within(reach, sections, **slot.options)
+        most = slot.module.bound(sections, read, **slot.options)
+        if slot.options.get("frame"):
+            most[:3] = reach
+        return most

@@ -9,23 +9,45 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fusedrf_cli.engine.decoders import density_sum, mlp, rgb, sh, sh_basis, trunk
+from fusedrf_cli.engine.decoders import (
+    density_linear,
+    density_sum,
+    direction_basis,
+    direction_texture,
+    mlp,
+    rgb,
+    sh,
+    sh_basis,
+    trunk,
+)
 from fusedrf_cli.engine.decoders.activations import COLOURS
-from fusedrf_cli.engine.encodings import frequencies, grid, hash_grid, line, plane_line, trunk_features
+from fusedrf_cli.engine.encodings import (
+    frequencies,
+    grid,
+    hash_grid,
+    line,
+    plane_line,
+    planes,
+    sparse_grid,
+    sparse_rows,
+    spheres,
+    trunk_features,
+    warped_frequencies,
+)
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 from fusedrf_cli.engine.fields.box import MAX_ANSWER
 from fusedrf_cli.engine.kernels.assembled import READS, assemble
 
-ENCODINGS = plane_line, line, grid, hash_grid, frequencies
+ENCODINGS = (
+    plane_line, line, grid, sparse_grid, spheres, hash_grid, planes, frequencies, warped_frequencies
+)  # fmt: skip
 PARTS: dict[str, tuple[ModuleType, ...]] = {
     "density": ENCODINGS,
-    "colour": (*ENCODINGS, trunk_features),
-    "sigma": (density_sum, trunk),
-    "rgb": (rgb, sh, sh_basis, mlp),
+    "colour": (*(part for part in ENCODINGS if part is not sparse_grid), sparse_rows, trunk_features),
+    "sigma": (density_sum, density_linear, trunk),
+    "rgb": (rgb, sh, sh_basis, direction_basis, direction_texture, mlp),
 }
 """What may fill each slot, by the names of their modules."""
-FARTHEST = 1e4
-"""From 0, of a box whose points are encoded as they are: `frequencies.bound` counts on it."""
 
 
 def name_of(module: ModuleType) -> str:
@@ -64,12 +86,17 @@ class PartsShape:
         """What fills the slots. Raises ValueError for what files may not say."""
         parts = {name: part_of(name, entry) for name, entry in self.entries.items()}
         colour, of_colour = parts["colour"]
-        if parts["sigma"][0] is trunk:
-            parts["sigma"][1]["width"] = width_of(*parts["density"])
+        sigma, of_sigma = parts["sigma"]
+        if sigma is not density_sum:
+            of_sigma["width"] = width_of(*parts["density"])
         if colour is trunk_features:
-            if parts["sigma"][0] is not trunk:
+            if sigma is density_sum:
                 raise ValueError("'trunk_features' of the colour needs a 'trunk' of the density")
-            of_colour["outputs"] = parts["sigma"][1]["outputs"]
+            of_colour["outputs"] = of_sigma.get("outputs", of_sigma["width"])
+        if colour is sparse_rows:
+            if parts["density"][0] is not sparse_grid:
+                raise ValueError("'sparse_rows' of the colour needs a 'sparse_grid' of the density")
+            of_colour["rows"] = parts["density"][1]["rows"]
         parts["rgb"][1]["width"] = width_of(colour, of_colour)
         return {name: Slot(module, options, f"{name}_") for name, (module, options) in parts.items()}
 
@@ -129,9 +156,6 @@ class PartsField(AssembledField):
 
     def check_answers(self) -> None:
         """See BoxField."""
-        encoded = [entry for entry in self.shape.entries.values() if entry.get("frame")]
-        if encoded and np.abs(self.box).max() > FARTHEST:
-            raise ValueError(f"the box of points that are encoded should lie within {FARTHEST:g} of 0")
         sigma = self.slots["sigma"].sizes
         if sigma["ACTIVATION"] == 1 and self.scale * np.exp(sigma["HIGHEST"]) > MAX_ANSWER:
             raise ValueError(f"the density would reach {self.scale:g} exp({sigma['HIGHEST']:g})")
