@@ -84,7 +84,11 @@ def contract(x: np.ndarray, d: np.ndarray, space: str | dict) -> tuple[np.ndarra
             n = np.maximum(np.linalg.norm(x, order, 1, keepdims=True), 1)
             return np.where(n > 1, (1 + shell - shell / n) * x / n, x)
 
-        per_y = constants.get("contracted_density", 0.0) == 1
+        per_y, n = constants.get("contracted_density", 0.0), np.linalg.norm(x, axis=1)
+        if per_y == 2:
+            units = [constants.get(f"unit_{axis}", 1.0) for axis in "xyz"]
+            length = np.linalg.norm(units * d, axis=1)
+            return coordinates(x), length * np.where(n > 1, shell * np.maximum((x * d).sum(1), 0) / n**3, 0)
         return coordinates(x), moved(coordinates, x, d) if per_y else np.ones(len(x))
     n = np.abs(x).max(1)
     far, axis = n > 1, np.abs(x).argmax(1)

@@ -55,6 +55,7 @@ SPACES = {
     "Linf": contracted_linf,
     "L2 of DVGO": space_of(contracted_l2, shell=0.2, contracted_density=1.0),
     "Linf of DVGO": space_of(contracted_linf, shell=0.2, contracted_density=1.0),
+    "spheres of svox2": space_of(contracted_l2, contracted_density=2.0, unit_x=0.8, unit_z=1.4),
     "stretched": space_of(contracted_linf, stretch_x=2.0, stretch_z=0.5, contracted_density=1.0),
     "NDC": ndc,
     "NDC of a camera": space_of(ndc, scale_x=2.1, scale_y=2.8),

@@ -46,6 +46,8 @@ class ParameterBlock:
     """Of a row of numbers, how many are stored; the others fill it up to whole runs and are 0. None: all."""
     fades: bool = False
     """See Group."""
+    whole: bool = False
+    """Whether they are whole numbers, by which others are found: files have them as such."""
 
     @property
     def on_vertices(self) -> bool:
@@ -248,6 +250,7 @@ class BoxField(ComputedField):
 
     def pack(self, part: ParameterBlock, values: torch.Tensor) -> torch.Tensor:
         """A part as it is stored."""
+        values = values.int() if part.whole else values
         used_values = values[torch.from_numpy(self.used)] if part.on_vertices else values
         return used_values if part.columns is None else used_values[..., : part.columns]
 
@@ -337,6 +340,14 @@ def largest(values: torch.Tensor, kept: int = 0) -> torch.Tensor:
     """The largest magnitudes, float64, over all dimensions but the last `kept`; no copy is made."""
     dims = tuple(range(values.dim() - kept))
     return torch.maximum(values.amax(dims), -values.amin(dims)).double()
+
+
+def check_whole(values: torch.Tensor, name: str, count: int) -> None:
+    """Raise ValueError unless values of that name are whole numbers from -1 to below `count`."""
+    low, high = float(values.amin()), float(values.amax())
+    if not (low >= -1 and high < count and torch.equal(values, values.round())):
+        found = f"found {low:g} to {high:g}"
+        raise ValueError(f"'{name}' should be whole numbers from -1 to {count - 1}, {found}")
 
 
 def lines_of(rows: np.ndarray, width: int) -> np.ndarray:

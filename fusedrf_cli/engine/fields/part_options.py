@@ -14,6 +14,8 @@ Layers = Annotated[int, Meta(ge=1, le=16)]
 Width = Annotated[int, Meta(ge=8, le=1024, multiple_of=8)]
 """Of a hidden layer."""
 Numbers = Annotated[int, Meta(ge=1, le=512)]
+Rows = Annotated[int, Meta(ge=1, le=1 << 24)]
+"""Of a table whose rows are found by whole numbers, which float32 has all up to that."""
 Coefficients = Literal[1, 4, 9, 16]
 """Of spherical harmonics."""
 Frequencies = Annotated[int, Meta(ge=0, le=24)]

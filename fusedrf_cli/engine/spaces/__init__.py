@@ -40,7 +40,9 @@ def name_of(space: ModuleType) -> str | dict:
     name = next(name for name, known in SPACES.items() if known is getattr(space, "VARIANT_OF", space))
     if space is SPACES[name]:
         return name
-    return {"name": name} | {constant: getattr(space, constant.upper()) for constant in space.CONSTANTS}
+    given = {constant: getattr(space, constant.upper()) for constant in space.CONSTANTS}
+    usual = {constant: getattr(SPACES[name], constant.upper()) for constant in given}
+    return {"name": name} | {constant: value for constant, value in given.items() if value != usual[constant]}
 
 
 @cache

@@ -6,6 +6,9 @@ Outside the ball it moves in the coordinates, with B = SHELL, by
     √(B² τ² + b² ((1 + B) |x| - B)²) / |x|³ <= c / (b² + τ²),  c = √(B² + (1 + B)² b²)
 for a unit of τ, and the integral of that bound is t_local: from τ0 on, with q = tan(t_local b / c) / b,
     τ(t_local) = (τ0 + b² q) / (1 - τ0 q).
+
+With the density OUTWARD all of the space but the ball is a stack of spheres, as behind a scene of Plenoxels:
+σ is per unit of 1/|x| (by SHELL), on a ray's way out alone, times the length of a unit of the frame that way.
 """
 
 import math
@@ -13,8 +16,8 @@ import math
 import torch
 
 from fusedrf_cli.engine.kernels.primitives import FARTHEST, along
+from fusedrf_cli.engine.spaces import curved
 from fusedrf_cli.engine.spaces.curved import (  # noqa: F401
-    CONSTANTS,
     CONTRACTED_DENSITY,
     CURVED,
     SHELL,
@@ -44,6 +47,10 @@ from fusedrf_cli.engine.spaces.unbounded import (  # noqa: F401
 )
 
 PIECES = 3  # up to the ball, or to where the ray is nearest to the origin; in the ball; behind it
+OUTWARD = 2.0  # of CONTRACTED_DENSITY: σ is per growth of |coordinates| along a ray, where they grow (svox2)
+UNIT_X = UNIT_Y = UNIT_Z = 1.0  # of the frame's axes, by the length that σ is per where it is OUTWARD
+CONSTANTS = curved.CONSTANTS | {"contracted_density": (0.0, OUTWARD)}
+CONSTANTS |= {f"unit_{axis}": (0.01, 100.0) for axis in "xyz"}
 INWARDS, INSIDE, OUTWARDS, BEYOND = 0, 1, 2, 3  # regions of a ray, in order
 
 
@@ -55,9 +62,14 @@ def size_of(p):
 def rate(q, d):
     """See bounded.py."""
     m = size_of(q)
-    if CONTRACTED_DENSITY == 0.0 or m <= 1.0:
+    if m <= 1.0:
+        return 0.0 if CONTRACTED_DENSITY == OUTWARD else 1.0
+    if CONTRACTED_DENSITY == 0.0:
         return 1.0
     n, out = size_before(m), (q[0] * d[0] + q[1] * d[1] + q[2] * d[2]) / m
+    if CONTRACTED_DENSITY == OUTWARD:
+        length = size_of((UNIT_X * d[0], UNIT_Y * d[1], UNIT_Z * d[2]))
+        return SHELL * max(out, 0.0) / (n * n) * length
     across = scale_of(n) * n * n
     return math.sqrt(SHELL * SHELL * out * out + max(1.0 - out * out, 0.0) * across * across) / (n * n)
 
@@ -175,4 +187,9 @@ def density_rates(points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
         return points.new_ones(len(points))
     x = inv_contract(points)
     n = x.norm(dim=1, keepdim=True)
-    return density_rates_by(x, dirs, n, (x * dirs).sum(1, keepdim=True) / n.clamp_min(1), SHELL)
+    growth = (x * dirs).sum(1, keepdim=True) / n.clamp_min(1)
+    if CONTRACTED_DENSITY == OUTWARD:
+        u, v, w = dirs.unbind(1)
+        length = torch.stack([UNIT_X * u, UNIT_Y * v, UNIT_Z * w]).norm(dim=0)
+        return length * torch.where(n > 1, SHELL * growth.clamp_min(0) / n.clamp_min(1) ** 2, 0).squeeze(1)
+    return density_rates_by(x, dirs, n, growth, SHELL)

@@ -12,6 +12,7 @@ from fusedrf_cli.engine.decoders import (
     density_linear,
     density_sum,
     direction_basis,
+    direction_texture,
     mlp,
     rgb,
     sh,
@@ -28,6 +29,9 @@ from fusedrf_cli.engine.encodings import (
     plane_line,
     plane_line_hash,
     planes,
+    sparse_grid,
+    sparse_rows,
+    spheres,
     trunk_features,
     warped_frequencies,
 )
@@ -42,6 +46,7 @@ from .interpreted import assert_answers, assert_gradients, interpreted, samples
 
 RUNS = HashGrid((0.31, 0.07), 64)
 HASHED = {"features": 2, "levels": hash_grid.levels_of(4, 6, 3, 1.7)}
+HELD, AROUND = {"rows": 40, "blocks": 6}, {"wide": 7, "high": 4, "layers": 3, "columns": 20}
 BY_ALL = [{"scale": 5.0, "side": 5, "rows": 32, "hashed": True, "offset": 0.0}] * 3
 WARP = {"count": 2, "hidden": 8, "layers": 3, "skip": 2}
 SHEET = {"count": 3, "hidden": 16, "layers": 1, "skip": 0}
@@ -61,8 +66,12 @@ DENSITIES = {
     "warped_frequencies": (warped_frequencies, WARPED),
     "still_too": (warped_frequencies, WARPED | {"still": True, "warp": SHEET, "sheet": WARP}),
     "always_hashed": (hash_grid, {"features": 2, "levels": BY_ALL}),
+    "sparse_grid": (sparse_grid, HELD),
+    "spheres": (spheres, {"numbers": 1, **AROUND}),
 }
 FEATURES = DENSITIES | {"plane_line": (plane_line, {"rank": 16}), "grid": (grid, {"numbers": 13})}
+FEATURES |= {"sparse_rows": (sparse_rows, {"numbers": 13, "rows": HELD["rows"]})}
+FEATURES |= {"spheres": (spheres, {"numbers": 3, **AROUND})}
 FEATURES |= {name: (trunk_features, {"outputs": count}) for name, count in (("of 16", 16), ("of 8", 8))}
 SIGMAS = {
     "density_sum": lambda width: (density_sum, {}),
@@ -80,6 +89,11 @@ COLOURS = {
     "sh": lambda width: (sh, {"width": width, "coefficients": 4 if width >= 12 else 1}),
     "direction_basis": lambda width: (direction_basis, {"width": width, "hidden": 8}),
     "deep_basis": lambda width: (direction_basis, {"width": width, "hidden": 16, "layers": 3}),
+    "own_basis": lambda width: (
+        direction_basis,
+        {"width": width, "hidden": 8, "own": width // 3, "frequencies": 2, "squashed": True},
+    ),
+    "texture": lambda width: (direction_texture, {"width": width, "own": width // 3, "side": 3}),
     "sh_mlp": lambda width: (sh_mlp, {"width": width, "hidden": 8}),
     "mlp": lambda width: (mlp, {"width": width, "rows": 5, "hidden": 11}),
     "deep_mlp": lambda width: (
@@ -154,6 +168,9 @@ PRODUCTS += [
     Recipe("planes_lines", "planes", "density_sum", "deep_basis"),
     Recipe("plane_line", "frequencies", "density_sum", "sh_mlp"),
     Recipe("planes", "of 16", "linear", "direction_basis"),
+    Recipe("spheres", "spheres", "relu", "sh", "relu"),
+    Recipe("sparse_grid", "sparse_rows", "density_sum", "texture"),
+    Recipe("sparse_grid", "sparse_rows", "relu", "own_basis", "relu"),
 ]
 
 
@@ -162,7 +179,13 @@ def product(recipe: Recipe) -> Product:
     scale, shift = (300.0, -6.0) if recipe.density == "plane_line_hash" else (3.0, 0.3)
     bare = Product(recipe, BOX, (5, 8, 7), scale, shift)
     generator = torch.Generator().manual_seed(0)
-    return bare.with_params(0.5 * torch.randn(len(bare.params), generator=generator, dtype=torch.float64))
+    field = bare.with_params(0.5 * torch.randn(len(bare.params), generator=generator, dtype=torch.float64))
+    counts = {"blocks": HELD["blocks"], "vertices": HELD["rows"], "columns": AROUND["columns"]}
+    for part, numbers in zip(field.parts, field.sections().values(), strict=True):
+        if part.whole:
+            count = counts[part.name.rpartition("_")[2]]
+            numbers.copy_(torch.randint(-1, count, part.shape, generator=generator))
+    return field
 
 
 @pytest.fixture(params=PRODUCTS, ids=lambda recipe: "-".join(vars(recipe).values()))
@@ -180,7 +203,7 @@ def test_device_functions_send_back_what_autograd_does(field, shaded):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", range(1, 7))
+@pytest.mark.parametrize("number", range(1, 9))
 def test_compiled_products_answer_and_send_back_as_their_references(number):
     """Of parts that no kind is made of, which nothing else compiles."""
     field = product(PRODUCTS[-number])

@@ -47,6 +47,7 @@ CURVED = {
     "Linf": contracted_linf,
     "DVGO L2": space_of(contracted_l2, **DVGO),
     "DVGO Linf": space_of(contracted_linf, **DVGO),
+    "svox2": space_of(contracted_l2, contracted_density=2.0),
     "stretched": space_of(contracted_linf, stretch_x=0.6, stretch_y=2.0, **DVGO),
 }
 NEW = CURVED | {"NDC": ndc, "NDC of a camera": space_of(ndc, scale_x=2.1, scale_y=2.8)}
@@ -104,6 +105,7 @@ FORMULAS = {
     "Linf": lambda x: scene_contraction(x, np.inf),
     "DVGO L2": lambda x: dvgo_contraction(x, 2, 0.2),
     "DVGO Linf": lambda x: dvgo_contraction(x, np.inf, 0.2),
+    "svox2": lambda x: scene_contraction(x, 2),
     "stretched": lambda x: dvgo_contraction(x * [0.6, 2.0, 1.0], np.inf, 0.2),
     "NDC": lambda x: ndc_of(x, 2, 2, 1.0),
     "NDC of a camera": lambda x: ndc_of(x, 300, 400, 420.0),
@@ -145,7 +147,8 @@ def test_rays_of_ndc_are_those_of_nerf():
 @new
 def test_densities_are_per_length_of_the_frame_or_of_the_coordinates(space):
     """Mip-NeRF 360's and nerfacto's are per length of the frame, whatever the contraction; DVGO's and those
-    in NDC per length of the coordinates along the ray: the Jacobian by differences."""
+    in NDC per length of the coordinates along the ray: the Jacobian by differences; those of svox2's spheres
+    per unit of 1/|x|, on the way out."""
     points, rng = points_of(space), np.random.default_rng(1)
     dirs = unit(rng.normal(size=points.shape))
     at = space.contract(torch.from_numpy(points))
@@ -154,6 +157,10 @@ def test_densities_are_per_length_of_the_frame_or_of_the_coordinates(space):
         move = 1e-6 * np.linalg.norm(points, axis=1, keepdims=True) * dirs
         ahead, behind = (space.contract(torch.from_numpy(points + s * move)) for s in (1, -1))
         expected = (ahead - behind).norm(dim=1).numpy() / np.linalg.norm(2 * move, axis=1)
+    if space is NEW["svox2"]:
+        ahead, behind = (1 / np.linalg.norm(points + s * move, axis=1) for s in (1, -1))
+        outside = np.linalg.norm(points, axis=1) > 1
+        expected = outside * np.maximum(behind - ahead, 0) / np.linalg.norm(2 * move, axis=1)
     found = [
         functions_of(space)["rate"](tuple(q), tuple(d))
         for q, d in zip(at.tolist(), dirs.tolist(), strict=True)
@@ -395,14 +402,14 @@ def some_rays(space, count: int) -> tuple[np.ndarray, np.ndarray]:
 @every
 def test_a_hash_grid_answers_in_the_space_as_its_reference(space):
     field = by_python(hashed_in(space))
-    points = torch.from_numpy(points_of(space, 30))
-    dirs = torch.from_numpy(unit(np.random.default_rng(1).normal(size=(30, 3))))
+    points = torch.from_numpy(points_of(space, 60))
+    dirs = torch.from_numpy(unit(np.random.default_rng(1).normal(size=(60, 3))))
     sigma, colour = field.query(points, dirs)
     expected, wanted = field.answers(field.params, points, dirs)
     assert (sigma > 0).sum() >= 5
     torch.testing.assert_close(sigma, expected, rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(colour, wanted, rtol=1e-9, atol=1e-9)
-    sent = torch.randn(30, dtype=torch.float64), torch.randn(30, 3, dtype=torch.float64)
+    sent = torch.randn(60, dtype=torch.float64), torch.randn(60, 3, dtype=torch.float64)
     rows, params = np.zeros((1, len(field.params))), field.params.clone().requires_grad_()
     field.query_backward(points, dirs, *sent, rows)
     torch.autograd.backward(field.answers(params, points, dirs), sent)
@@ -481,6 +488,8 @@ def test_fog_is_as_thick_as_its_formula_says(space):
         lengths = np.diff(t)
         if "ndc" in space.__name__ or getattr(space, "CONTRACTED_DENSITY", 0):
             lengths = np.linalg.norm(np.diff(q, axis=0), axis=1)
+        if space is NEW["svox2"]:
+            lengths = np.maximum(np.diff(np.maximum(np.linalg.norm(q, axis=1), 1)), 0)
         assert -np.log(1 - found[i, 3]) == pytest.approx(sigma * lengths[inside].sum(), rel=0.02, abs=2e-3)
 
 

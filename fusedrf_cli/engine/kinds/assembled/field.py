@@ -13,6 +13,7 @@ from fusedrf_cli.engine.decoders import (
     density_linear,
     density_sum,
     direction_basis,
+    direction_texture,
     mlp,
     rgb,
     sh,
@@ -27,6 +28,9 @@ from fusedrf_cli.engine.encodings import (
     line,
     plane_line,
     planes,
+    sparse_grid,
+    sparse_rows,
+    spheres,
     trunk_features,
     warped_frequencies,
 )
@@ -34,12 +38,14 @@ from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 from fusedrf_cli.engine.fields.box import MAX_ANSWER
 from fusedrf_cli.engine.kernels.assembled import READS, assemble
 
-ENCODINGS = plane_line, line, grid, hash_grid, planes, frequencies, warped_frequencies
+ENCODINGS = (
+    plane_line, line, grid, sparse_grid, spheres, hash_grid, planes, frequencies, warped_frequencies
+)  # fmt: skip
 PARTS: dict[str, tuple[ModuleType, ...]] = {
     "density": ENCODINGS,
-    "colour": (*ENCODINGS, trunk_features),
+    "colour": (*(part for part in ENCODINGS if part is not sparse_grid), sparse_rows, trunk_features),
     "sigma": (density_sum, density_linear, trunk),
-    "rgb": (rgb, sh, sh_basis, direction_basis, mlp),
+    "rgb": (rgb, sh, sh_basis, direction_basis, direction_texture, mlp),
 }
 """What may fill each slot, by the names of their modules."""
 FARTHEST = 1e4
@@ -89,6 +95,10 @@ class PartsShape:
             if sigma is density_sum:
                 raise ValueError("'trunk_features' of the colour needs a 'trunk' of the density")
             of_colour["outputs"] = of_sigma.get("outputs", of_sigma["width"])
+        if colour is sparse_rows:
+            if parts["density"][0] is not sparse_grid:
+                raise ValueError("'sparse_rows' of the colour needs a 'sparse_grid' of the density")
+            of_colour["rows"] = parts["density"][1]["rows"]
         parts["rgb"][1]["width"] = width_of(colour, of_colour)
         return {name: Slot(module, options, f"{name}_") for name, (module, options) in parts.items()}
 
