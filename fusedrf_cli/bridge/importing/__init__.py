@@ -52,7 +52,7 @@ UNREAD = {
     "outside its space, which the file does not tell; train it with DVGO's bounded or unbounded model"
 }
 """Why checkpoints of a system are not read, where that is known."""
-COPIES = 4.0
+COPIES = 5.5
 """Of an array, of what its field takes: read, rearranged, as numbers and as they are written."""
 
 
@@ -127,6 +127,8 @@ def imported_from(checkpoint: Checkpoint, request: ImportRequest, capture: Captu
 def box_of(request: ImportRequest, capture: Capture | None, checkpoint: Checkpoint) -> np.ndarray:
     """The box (6,) of a field whose file has none: as given, or what cameras see between two distances."""
     if request.aabb is not None:
+        if request.near or request.far:
+            raise UsageProblem("--aabb is the box itself; leave out --near and --far")
         box = np.array(request.aabb)
         if not (box[:3] < box[3:]).all():
             raise UsageProblem(f"--aabb should be three minima below three maxima, found {request.aabb}")

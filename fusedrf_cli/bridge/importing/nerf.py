@@ -25,13 +25,13 @@ from fusedrf_cli.bridge.importing.parts import (
     scattered,
     trunk_layers,
 )
+from fusedrf_cli.engine.decoders.sh_mlp import HARMONICS
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsShape
 
 SAMPLES = 256
 """Vertices along the longest side by which rays are sampled."""
 BASE, FINEST = 16, 512  # vertices of HashNeRF's coarsest grid, and of the finest where nothing is said
-HARMONICS = 16  # numbers of a direction in HashNeRF's spherical harmonics
 FINE = "of its coarse and fine networks the fine one is taken"
 NDC = "its frame is that of the normalised device coordinates that it was trained in"
 
@@ -73,23 +73,26 @@ def read_krrish(checkpoint, box: np.ndarray) -> Imported:
         return finished(encoding, sigma, rgb, sections, box, notes)
     out = stacked(state.layer("fc_alpha"), (np.eye(hidden), None))
     sigma, sections = skipping([*layers, out], encoding["count"], hidden_first=True)
-    (feature, bias), (weight, own), *others = state.layer("fc_feat"), *state.layers("layers_dir.")
-    check_layers([(feature, bias), (weight[:, : len(feature)], own)], hidden)
-    count, directions = len(feature), weight.shape[1] - len(feature)
+    feature, (first, *others) = state.layer("fc_feat"), state.layers("layers_dir.")
+    directions = first[0].shape[1] - len(feature[0])
     order, columns = seen(sigma["outputs"], hidden, directions)
-    # A direction e passes a rectified layer as max(0, e) and max(0, -e).
-    made, made_bias = (
-        np.zeros((count + 2 * directions, hidden + directions)),
-        np.zeros(count + 2 * directions),
-    )
-    made[:count, : feature.shape[1]] = feature
-    made[count:, hidden:] = np.concatenate([np.eye(directions), -np.eye(directions)])
-    made_bias[:count] = 0 if bias is None else bias
-    second = np.concatenate([weight, -weight[:, count:]], 1), own
-    network = [(made, made_bias), second, *others, state.layer("fc_rgb")]
+    network = [*passing(feature, first, hidden, directions), *others, state.layer("fc_rgb")]
     columns = np.concatenate([order.at("features")[1:], columns])
     rgb, colours = colour_network(network, order, columns)
     return finished(encoding, sigma, rgb, sections | colours, box, notes)
+
+
+def passing(feature: Layer, first: Layer, hidden: int, directions: int) -> list[Layer]:
+    """A rectified layer of features that a direction, so many numbers e behind `hidden` others, passes as
+    max(0, e) and max(0, -e), and the layer that reads both."""
+    (weight, bias), (reading, own) = feature, first
+    count = len(weight)
+    check_layers([feature, (reading[:, :count], own)], hidden)
+    made = np.zeros((count + 2 * directions, hidden + directions))
+    made[:count, :hidden] = weight
+    made[count:, hidden:] = np.concatenate([np.eye(directions), -np.eye(directions)])
+    bias = np.concatenate([np.zeros(count) if bias is None else bias, np.zeros(2 * directions)])
+    return [(made, bias), (np.concatenate([reading, -reading[:, count:]], 1), own)]
 
 
 def read_hashed(checkpoint, box: np.ndarray) -> Imported:
@@ -131,7 +134,7 @@ def hashed_levels(count: int, rows: int, finest: int) -> list[dict[str, Any]]:
 def hashed_box(checkpoint) -> np.ndarray | None:
     """The box (6,) of HashNeRF's grid that its run's settings state, with four digits."""
     stated = str(checkpoint.beside.get("args.txt", {}).get("bounding_box"))
-    numbers = re.findall(r"[-+.\de]+", " ".join(re.findall(r"tensor\(\[([^]]*)\]", stated)))
+    numbers = re.findall(r"-?\d+\.?\d*(?:e[-+]\d+)?", " ".join(re.findall(r"tensor\(\[([^]]*)\]", stated)))
     return np.array(numbers, np.float64) if len(numbers) == 6 else None
 
 
@@ -238,9 +241,8 @@ def with_point(layers: Sequence[Layer], inputs: int) -> list[Layer]:
 
 def stacked(*layers: Layer) -> Layer:
     """Layers that read the same, as one."""
-    if len({weight.shape[1] for weight, _ in layers}) > 1:
-        found = " and ".join(str(weight.shape[1]) for weight, _ in layers)
-        raise FormatError(f"layers behind the same one should read as many numbers, found {found}")
+    if len(reads := {weight.shape[1] for weight, _ in layers}) > 1:
+        raise FormatError(f"layers side by side should read as many numbers, found {sorted(reads)}")
     weights = np.concatenate([weight for weight, _ in layers])
     biases = [np.zeros(len(weight)) if bias is None else bias for weight, bias in layers]
     return weights, np.concatenate(biases)

@@ -82,7 +82,7 @@ class Entries:
         if not fits or any(n not in (None, m) for n, m in zip(shape, found, strict=False)):
             expected = [n or "any" for n in shape]
             raise FormatError(f"{self.where}'{name}' should have shape {expected}, found {list(found)}")
-        value = value if value.dtype == np.float64 else value.astype(np.float32)
+        value = value if value.dtype == np.float64 else value.astype(np.float32, copy=False)
         if not np.isfinite(value).all():
             raise FormatError(f"{self.where}'{name}' holds NaN or infinity")
         return value
@@ -162,7 +162,8 @@ def parts_field(
         target, value = sections[name], np.asarray(value, np.float32)
         if value.ndim != target.dim() or any(n > m for n, m in zip(value.shape, target.shape, strict=True)):
             raise FormatError(f"{name} should fit into {list(target.shape)}, found {list(value.shape)}")
-        target[tuple(slice(n) for n in value.shape)] = torch.from_numpy(np.ascontiguousarray(value))
+        value = value if min(value.strides, default=0) >= 0 else value.copy()  # which torch cannot read
+        target[tuple(slice(n) for n in value.shape)] = torch.from_numpy(value)
     field.check_answers()
     return field
 

@@ -206,6 +206,7 @@ WRONG = {
     "no box": ((), "does not say where its scene lies; give the box as --aabb"),
     "no cameras": (("--near", 2, "--far", 6), "does not say where its scene lies"),
     "near beyond far": (("--near", 6, "--far", 2), "--near 6 should be less than --far 2"),
+    "two boxes": (("--aabb", "-1,-1,-1,1,1,1", "--far", 6), "leave out --near and --far"),
     "a box inside out": (("--aabb", "1,1,1,0,0,0"), "with each minimum below its maximum"),
 }
 
@@ -465,7 +466,7 @@ BROKEN = {
     "no frequencies": (with_shape("pts_linears.0.weight", 16, 14), "6 for each frequency, found 14"),
     "features of another width": (
         with_shape("feature_linear.weight", 16, 12),
-        "read as many numbers, found 16 ",
+        r"read as many numbers, found \[12, 16\]",
     ),
     "a vector": (with_shape("pts_linears.0.weight", 16), "should have shape"),
     "another bias": (with_shape("pts_linears.0.bias", 15), r"should have shape \[16\], found \[15\]"),

@@ -48,6 +48,8 @@ PARTS: dict[str, tuple[ModuleType, ...]] = {
     "rgb": (rgb, sh, sh_basis, direction_basis, direction_texture, mlp),
 }
 """What may fill each slot, by the names of their modules."""
+FARTHEST = 1e4
+"""From 0, of a box whose points are encoded as they are: `frequencies.bound` counts on it."""
 
 
 def name_of(module: ModuleType) -> str:
@@ -156,6 +158,9 @@ class PartsField(AssembledField):
 
     def check_answers(self) -> None:
         """See BoxField."""
+        encoded = [entry for entry in self.shape.entries.values() if entry.get("frame")]
+        if encoded and np.abs(self.box).max() > FARTHEST:
+            raise ValueError(f"the box of points that are encoded should lie within {FARTHEST:g} of 0")
         sigma = self.slots["sigma"].sizes
         if sigma["ACTIVATION"] == 1 and self.scale * np.exp(sigma["HIGHEST"]) > MAX_ANSWER:
             raise ValueError(f"the density would reach {self.scale:g} exp({sigma['HIGHEST']:g})")
