@@ -52,7 +52,7 @@ UNREAD = {
     "outside its space, which the file does not tell; train it with DVGO's bounded or unbounded model"
 }
 """Why checkpoints of a system are not read, where that is known."""
-COPIES = 4.0
+COPIES = 5.5
 """Of an array, of what its field takes: read, rearranged, as numbers and as they are written."""
 
 

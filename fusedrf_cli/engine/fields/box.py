@@ -251,8 +251,8 @@ class BoxField(ComputedField):
     def pack(self, part: ParameterBlock, values: torch.Tensor) -> torch.Tensor:
         """A part as it is stored."""
         values = values.int() if part.whole else values
-        used_values = values[torch.from_numpy(self.used)] if part.on_vertices else values
-        return used_values if part.columns is None else used_values[..., : part.columns]
+        values = values if part.columns is None else values[..., : part.columns]
+        return values[torch.from_numpy(self.used)] if part.on_vertices else values
 
     def unpack(self, part: ParameterBlock, stored: torch.Tensor, values: torch.Tensor) -> None:
         """Inverse of `pack`, into a part that is 0, as what is not stored stays."""
