@@ -98,7 +98,7 @@ import flat
 told, device_module = [], assemble(flat, flat, density_sum, rgb)
 sizes = {{"density": flat.sizes(), "colour": flat.sizes(), "sigma": density_sum.sizes(), "rgb": rgb.sizes(3)}}
 slots = {{name: SimpleNamespace(sizes=s) for name, s in sizes.items()}}
-sizes = device_module.sizes(SimpleNamespace(slots=slots))
+sizes = device_module.sizes(SimpleNamespace(slots=slots, colour_activation="sigmoid"))
 field = device_module.Arrays(np.ones(4), np.zeros(3), np.ones(3), np.array([1.0, 20.0]))
 grid = kernels.GridArrays(np.zeros((1, 1, 1), np.uint8), np.zeros(3), np.ones(3), np.ones(3))
 with kernels.report_compilation(lambda: told.append(1)):
