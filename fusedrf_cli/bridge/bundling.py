@@ -71,6 +71,7 @@ class FusedBundle:
             generator=f"fusedrf {__version__}",
             framing=self.framing,
             cameras=self.cameras,
+            up=self.loaded.graph.up,
         )
 
     def write(self, output: str, made: BestTrial, background: Background | None, entry: dict) -> int:

@@ -144,6 +144,7 @@ class ObjectCutout(Cutout):
             self.graph.composition,
             framing=tuple(float(x) for x in framing),
             cameras=cameras,
+            up=self.graph.up,
             generator=f"fusedrf {__version__}",
         )
 

@@ -52,6 +52,7 @@ def save_scene(
         extras=scene.graph.extras,
         framing=scene.graph.framing,
         cameras=result_cameras(scene),
+        up=scene.graph.up,
     )
     writer.write(output, writer.unfolded(graph), overwrite=overwrite)
     return Path(output).stat().st_size

@@ -1,6 +1,7 @@
 """The views that `render` takes: those of a file, those of the capture that a scene keeps, or ones that look
 at what the scene shows."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,14 +60,19 @@ def aimed(request: RenderRequest) -> bool:
     return any(word is not None for word in options) or request.zoom != 1
 
 
+def unit_vector(direction: Sequence[float]) -> np.ndarray:
+    """(3,) of length 1, along a direction of any other."""
+    scaled = np.array(direction) / np.abs(direction).max()  # whose square neither overflows nor vanishes
+    return scaled / np.linalg.norm(scaled)
+
+
 def upward(request: RenderRequest, scene: LoadedScene) -> np.ndarray:
     """(3,) unit vector: which way of the world is up. As was asked for, or as photos of an unbounded scene
     were held; for anything else +z, but where the photos of one object were held quite otherwise."""
     if request.up is not None:
-        up = np.array(request.up) / np.abs(request.up).max()
-        return up / np.linalg.norm(up)
+        return unit_vector(request.up)
     if scene.graph.up is not None:
-        return np.array(scene.graph.up) / np.linalg.norm(scene.graph.up)
+        return unit_vector(scene.graph.up)
     camera_set = camera_set_of(scene)
     if camera_set is None or camera_set.surroundings:
         return UP if camera_set is None else camera_set.up

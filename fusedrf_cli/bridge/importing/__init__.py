@@ -22,6 +22,7 @@ from fusedrf_cli import __version__
 from fusedrf_cli.bridge.importing import nerf, splats
 from fusedrf_cli.bridge.importing.parts import Imported
 from fusedrf_cli.bridge.memory import Memory
+from fusedrf_cli.bridge.views import unit_vector
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.spaces import bounded
 from fusedrf_cli.errors import InvalidInput, UsageProblem
@@ -172,8 +173,7 @@ def write(
         unbounded = any(node.field.space is not bounded for node in imported.nodes)
         cameras = capture_camera_set(capture, surroundings=unbounded).content()
     if request.up is not None:
-        up = np.array(request.up) / np.abs(request.up).max()
-        up = tuple((up / np.linalg.norm(up)).tolist())
+        up = tuple(unit_vector(request.up).tolist())
     graph = SceneGraph(tuple(nodes), generator=f"fusedrf {__version__}", cameras=cameras, up=up)
     writer.write(request.output, graph, overwrite=request.overwrite)
     return graph

@@ -170,7 +170,7 @@ def parts_field(
 
 def ranks_filled(ranks: Sequence[int]) -> int:
     """The rank of all modes: the largest, up to a run of eight."""
-    return -(-max(ranks) // 8) * 8
+    return eight(max(ranks))
 
 
 def beside(blocks: Sequence[np.ndarray], width: int) -> np.ndarray:
@@ -247,12 +247,7 @@ def colour_network(
     }  # fmt: skip
     inputs = mlp.layer_shapes(order.width, 0, hidden, len(layers) - 1, order.frequencies, entry["direction"],
                               order.point)[0][0]  # fmt: skip
-    sections = {}
-    for i, (weight, bias) in enumerate(layers):
-        if i == 0:
-            weight = scattered(weight, columns, inputs)
-        sections[f"rgb_layer_{i}"] = packed(weight, bias, hidden if i else inputs)
-    return entry, sections
+    return entry, packed_layers("rgb", layers, columns, inputs, hidden)
 
 
 def check_layers(layers: Sequence[Layer], inputs: int, outputs: int | None = None) -> int:
@@ -284,6 +279,17 @@ def packed(weight: np.ndarray, bias: np.ndarray | None, inputs: int) -> np.ndarr
     return made
 
 
+def packed_layers(
+    slot: str, layers: Sequence[Layer], columns: np.ndarray, inputs: int, hidden: int
+) -> dict[str, np.ndarray]:
+    """The sections of a network of a slot whose first layer reads `columns` (N,) of so many inputs, and whose
+    hidden ones are filled up to a width."""
+    (weight, bias), *others = layers
+    sections = [packed(scattered(weight, columns, inputs), bias, inputs)]
+    sections += [packed(weight, bias, hidden) for weight, bias in others]
+    return {f"{slot}_layer_{i}": section for i, section in enumerate(sections)}
+
+
 def trunk_layers(
     layers: Sequence[Layer], width: int, columns: np.ndarray | None = None, activation: str = "exp",
     limits: tuple[float, float] = (-80.0, 50.0),
@@ -298,9 +304,4 @@ def trunk_layers(
         "part": "trunk", "hidden": hidden, "outputs": eight(len(layers[-1][0])), "layers": len(layers) - 1,
         "activation": activation, "limits": list(limits),
     }  # fmt: skip
-    sections = {}
-    for i, (weight, bias) in enumerate(layers):
-        if i == 0:
-            weight = scattered(weight, columns, width)
-        sections[f"sigma_layer_{i}"] = packed(weight, bias, hidden if i else width)
-    return entry, sections
+    return entry, packed_layers("sigma", layers, columns, width, hidden)

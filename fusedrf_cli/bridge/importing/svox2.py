@@ -11,7 +11,7 @@ from fusedrf_cli.bridge.importing.parts import (
     Imported,
     ImportedNode,
     check_layers,
-    packed,
+    packed_layers,
     parts_field,
 )
 from fusedrf_cli.engine.encodings.sparse_grid import tables_of
@@ -136,10 +136,8 @@ def network_of(entries: Entries, count: int) -> tuple[dict, dict[str, np.ndarray
     layers = Entries(named, f"{MLP}: ").layers("")
     frequencies = max(layers[0][0].shape[1] - 3, 0) // 6
     hidden = check_layers(layers, 3 + 6 * frequencies, count)
-    sections = {
-        f"rgb_layer_{i}": packed(weight, bias, hidden if i else 3 + 6 * frequencies)
-        for i, (weight, bias) in enumerate(layers)
-    }
+    inputs = 3 + 6 * frequencies
+    sections = packed_layers("rgb", layers, np.arange(inputs), inputs, hidden)
     return {
         "part": "direction_basis", "hidden": hidden, "layers": len(layers) - 1, "own": count,
         "frequencies": frequencies, "squashed": True,

@@ -8,8 +8,7 @@ from fusedrf_cli.engine.settings import current
 
 def starts_coarse(student: StoredField, coarse_from: int | None) -> bool:
     """Whether a student is on one grid large enough, in texels, to have half its resolution first."""
-    on_texels = student.resolution is not None and student.over_texels
-    return on_texels and coarse_from is not None and max(student.resolution) >= coarse_from
+    return None not in (student.resolution, coarse_from) and max(student.resolution) >= coarse_from
 
 
 def halved(student: StoredField) -> StoredField:

@@ -13,6 +13,8 @@ from formats.records import FieldRecord, decode_field, encode_field
 from fusedrf_cli.bridge.importing import k_planes
 from fusedrf_cli.bridge.scene import make_field
 
+from .hash_oracle import harmonics
+
 
 @dataclass(frozen=True)
 class Model:
@@ -106,21 +108,6 @@ def evaluated(params, x: np.ndarray, outputs: int, hidden: int, layers: int, by:
         x = x @ params[start : start + m * n].reshape(n, m).T.astype(np.float64)
         x, start = np.maximum(x, 0) if i < layers else x, start + m * n
     return x[:, :outputs]
-
-
-def harmonics(d: np.ndarray) -> np.ndarray:
-    """Of degree 4, as tiny-cuda-nn has them."""
-    x, y, z = d.T
-    xx, yy, zz = x * x, y * y, z * z
-    return np.stack([
-        0.28209479177387814 + 0 * x, -0.48860251190291987 * y, 0.48860251190291987 * z,
-        -0.48860251190291987 * x, 1.0925484305920792 * x * y, -1.0925484305920792 * y * z,
-        0.94617469575755997 * zz - 0.31539156525251999, -1.0925484305920792 * x * z,
-        0.54627421529603959 * (xx - yy), 0.59004358992664352 * y * (yy - 3 * xx),
-        2.8906114426405538 * x * y * z, 0.45704579946446572 * y * (1 - 5 * zz),
-        0.3731763325901154 * z * (5 * zz - 3), 0.45704579946446572 * x * (1 - 5 * zz),
-        1.4453057213202769 * z * (xx - yy), 0.59004358992664352 * x * (3 * yy - xx),
-    ], 1)  # fmt: skip
 
 
 def features_of(model: Model, state: dict, points: np.ndarray, time: float | None) -> np.ndarray:

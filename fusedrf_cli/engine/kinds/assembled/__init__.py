@@ -1,27 +1,15 @@
 """The `assembled` kind: fields of any encodings and decoders, as other systems' files are made of."""
 
-from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.kinds.assembled.field import PartsField
-from fusedrf_cli.engine.kinds.builder import Suitability
-from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.sweeps import Sweep
+from fusedrf_cli.engine.kinds.imported_kind import ImportedKind
 
 
-class AssembledKind(Kind):
+class AssembledKind(ImportedKind):
     """See Kind."""
 
     name = "assembled"
     good_for = "What `fusedrf import` makes of other systems' files: their own numbers, nothing learnt."
     field = PartsField
-    trains = False
-
-    def suits(self, scene: ComposedField) -> Suitability:
-        """See Kind."""
-        return Suitability(None, f"fields of kind '{self.name}' are imported, and nothing is fused to them")
-
-    def sweeps(self, least_psnr: float) -> dict[str, list[Sweep]]:
-        """See Kind."""
-        return {}
 
     def describe(self, field: PartsField) -> dict:
         """See Kind."""

@@ -1,27 +1,15 @@
 """The `splats` kind: 3D Gaussian splatting's Gaussians, as they are imported."""
 
-from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.kinds.builder import Suitability
-from fusedrf_cli.engine.kinds.kind import Kind
+from fusedrf_cli.engine.kinds.imported_kind import ImportedKind
 from fusedrf_cli.engine.kinds.splats.field import ARRAYS, SplatsField
-from fusedrf_cli.engine.kinds.sweeps import Sweep
 
 
-class SplatsKind(Kind):
+class SplatsKind(ImportedKind):
     """See Kind."""
 
     name = "splats"
     good_for = "What `fusedrf import` makes of a splat file: its own Gaussians, nothing learnt."
     field = SplatsField
-    trains = False
-
-    def suits(self, scene: ComposedField) -> Suitability:
-        """See Kind."""
-        return Suitability(None, f"fields of kind '{self.name}' are imported, and nothing is fused to them")
-
-    def sweeps(self, least_psnr: float) -> dict[str, list[Sweep]]:
-        """See Kind."""
-        return {}
 
     def on_one_grid(self, field: SplatsField) -> SplatsField:
         """See Kind: cells are cut, and splats stay whole."""

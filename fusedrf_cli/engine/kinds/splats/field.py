@@ -81,13 +81,10 @@ class SplatsField(ComputedField):
     @cached_property
     def axes(self) -> np.ndarray:
         """(N, 3, 3) float64 unit axes of the splats, in rows."""
-        w, x, y, z = self.rotations.astype(np.float64).T
-        columns = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
-            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
-            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        return np.moveaxis(np.array(columns), -1, 0).copy()
+        from scipy.spatial.transform import Rotation
+
+        turned = Rotation.from_quat(self.rotations.astype(np.float64), scalar_first=True).as_matrix()
+        return np.ascontiguousarray(turned.transpose(0, 2, 1))
 
     @cached_property
     def radius(self) -> np.ndarray:
