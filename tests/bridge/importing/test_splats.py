@@ -40,6 +40,16 @@ def test_a_file_becomes_a_bundle_that_answers_and_knows_what_is_up(tmp_path):
     assert OpenBundle(tmp_path / "renamed.rfpack").scene.up == (0.0, 0.0, 1.0)
 
 
+def test_what_is_made_of_a_scene_is_upright_as_the_scene_is(tmp_path):
+    centres = np.random.default_rng(0).uniform(-1, 1, (300, 3))
+    bundle = tmp_path / "balls.rfpack"
+    verbs.import_field(splat_file(tmp_path / "balls.splat", centres), bundle)
+    verbs.extract(bundle, tmp_path / "few.rfpack", boxes=((-0.5, -0.5, -0.5, 0.5, 0.5, 0.5),))
+    verbs.fuse(bundle, tmp_path / "fused.rfpack", time_budget=10)
+    for made in ("few", "fused"):
+        assert OpenBundle(tmp_path / f"{made}.rfpack").scene.up == (0.0, -1.0, 0.0)
+
+
 def test_what_lies_far_away_becomes_a_field_of_its_own(tmp_path):
     rng = np.random.default_rng(1)
     centres = np.concatenate([rng.uniform(-1, 1, (400, 3)), rng.uniform(-300, 300, (3, 3))])
