@@ -20,9 +20,8 @@ from fusedrf_cli.bridge.importing.parts import (
     check_layers,
     colour_network,
     eight,
-    packed,
+    packed_layers,
     parts_field,
-    scattered,
     trunk_layers,
 )
 from fusedrf_cli.engine.decoders.sh_mlp import HARMONICS
@@ -280,10 +279,7 @@ def skipping(
         "outputs": eight(len(layers[-1][0])),
         "layers": len(layers) - 1,
     }
-    sections = {}
-    for i, (weight, bias) in enumerate(layers):
-        weight = scattered(weight, np.arange(inputs), width) if i == 0 else weight
-        sections[f"sigma_layer_{i}"] = packed(weight, bias, width if i == 0 else hidden)
+    sections = packed_layers("sigma", layers, np.arange(inputs), width, hidden)
     for i, point in again.items():
         entry["skip"], sections["sigma_again"] = i, point.T
     return entry, sections
