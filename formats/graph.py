@@ -3,13 +3,13 @@
 A name means the node that has it, with all in it, and nodes that are named as parts of it, `NAME/...`.
 """
 
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from formats.errors import BadSchema, FormatError
-from formats.nodes import WHITE, check_name, multiplied
+from formats.nodes import WHITE, Crop, check_name, multiplied
 from formats.scene import Node, SceneGraph
 
 Becoming = Callable[[Node, np.ndarray], tuple[Node, ...]]
@@ -158,6 +158,22 @@ def shown(node: Node, showing: dict) -> Node:
     """A node with other words for what is shown of it; None takes one away."""
     words = {**node.showing, **showing}
     return replace(node, showing={key: value for key, value in words.items() if value is not None})
+
+
+def cropped(node: Node, crops: Sequence[Crop], names: set[str]) -> Node:
+    """A node of which only what crops of its frame hold is shown. Where these lie in other frames than its
+    own, it is in groups that are cropped, of names that no node has, which are taken from now on."""
+    own = node.node_to_parent
+    for crop in reversed(crops):
+        at = own @ np.linalg.inv(crop.object_to_shape)
+        if "crop" in node.showing or not np.array_equal(at, node.node_to_parent):
+            inner = np.linalg.solve(at, node.node_to_parent)
+            inner[3] = 0, 0, 0, 1
+            node = replace(node, placement=placement_of(inner))
+            group = free_name(f"{node.name}/cropped", names)
+            node = Node(group, None, None, placement_of(at), children=(node,))
+        node = shown(node, {"crop": list(crop.shape)})
+    return node
 
 
 def placement_of(matrix: np.ndarray) -> dict:

@@ -114,20 +114,9 @@ class Crop:
     object_to_shape: np.ndarray
     """(4, 4) float64 from an object's frame to that of the shape."""
 
-    def __repr__(self) -> str:
-        return f"Crop({self.shape}, {self.object_to_shape.tolist()})"
-
     def within(self, matrix: np.ndarray) -> "Crop":
         """The crop for an object that lies in this one's by a (4, 4)."""
         return replace(self, object_to_shape=self.object_to_shape @ matrix)
-
-    def holds(self, points: np.ndarray) -> np.ndarray:
-        """(N,) bool: which points (N, 3) of the object's frame it keeps."""
-        at = points @ self.object_to_shape[:3, :3].T + self.object_to_shape[:3, 3]
-        shape = np.array(self.shape)
-        if len(shape) == 4:
-            return ((at - shape[:3]) ** 2).sum(1) <= shape[3] ** 2
-        return ((at >= shape[:3]) & (at <= shape[3:])).all(1)
 
 
 def make_node(

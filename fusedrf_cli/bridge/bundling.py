@@ -114,23 +114,19 @@ class FusedBundle:
         fields = distinct_fields(result) if isinstance(result, ComposedField) else [result]
         of_source = dict(zip(map(id, distinct_fields(self.composed)), fields, strict=True))
         precisions = {id(one): made.storage.precision_of(i) for i, one in enumerate(fields)}
-        # what crops leave of a field is a field of its own where numbers are stored anew
-        cuts = [leaf.crops and of_source[id(f.placed.field)] is not f.placed.field for leaf, f in self.leaves]
-        cut, members = any(cuts), {}
+        members = {}
 
-        def member(leaf: Leaf, source: SourceField) -> str:
+        def member(source: SourceField) -> str:
             field = of_source[id(source.placed.field)]
-            if field is source.placed.field and not (cut and leaf.crops):
+            if field is source.placed.field:
                 return writer.copy_field(source.bundle, source.member)
             if id(field) not in members:
-                unchanged = field is source.placed.field
-                precision = source.bundle.headers[source.member].precision if unchanged else None
-                members[id(field)] = add(writer, opened(field), precision or precisions[id(field)])
+                members[id(field)] = add(writer, opened(field), precisions[id(field)])
             return members[id(field)]
 
-        named = iter([member(leaf, source) for leaf, source in self.leaves])
+        named = iter(map(member, self.loaded.fields))
         graph = with_leaves(self.graph, lambda node: replace(node, field=next(named)))
-        return uncropped(graph) if cut else graph
+        return uncropped(graph) if any(f.cut for f in self.loaded.fields) else graph
 
     @property
     def leaves(self) -> list[tuple[Leaf, SourceField]]:
@@ -148,7 +144,7 @@ class FusedBundle:
         own = self.loaded.fields if not self.learnt else [self.background_source for _ in placed]
         by_member: dict[str, dict] = {}
         for leaf, f in zip(placed, own, strict=True):
-            if leaf.field == f.member or f.cropped:
+            if leaf.field == f.member or f.cut:
                 continue
             entry = {"field": f.member}
             if f.member not in self.kept:
@@ -207,7 +203,7 @@ def uncropped(graph: SceneGraph) -> SceneGraph:
 
 def stored_bytes(loaded: LoadedScene) -> Mapping[int, int]:
     """Bytes of the members of fields that their bundles have, by the field's id."""
-    known = (f for f in loaded.fields if f.member in f.bundle.headers and not f.cropped)
+    known = (f for f in loaded.fields if f.member in f.bundle.headers and not f.cut)
     return {id(f.placed.field): f.bundle.headers[f.member].size for f in known}
 
 

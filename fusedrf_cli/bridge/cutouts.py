@@ -17,7 +17,6 @@ from formats.scene import Leaf, Node, SceneGraph, dump_scene
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.cutting import Fields, Whole
 from fusedrf_cli.bridge.field_bundle import stored
-from fusedrf_cli.bridge.scene import part_shown
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import placement
@@ -35,7 +34,9 @@ class Cutout:
         or, where that would round its numbers once more and they may not be `rounded`, in float16."""
         self.whole, self.precision, self.rounded = whole, precision, rounded
         self.writer = BundleWriter()
-        members = {leaf.name: self.member(leaf, fields.get(leaf.name)) for leaf, _ in whole.nodes}
+        members = {
+            leaf.name: self.member(leaf, placed, fields.get(leaf.name)) for leaf, placed in whole.nodes
+        }
 
         def after(node: Node) -> Node | None:
             if node.name not in members and node.name in hidden:
@@ -45,12 +46,12 @@ class Cutout:
 
         self.graph = with_leaves(whole.scene, after)
 
-    def member(self, leaf: Leaf, part: StoredField | None) -> str | None:
+    def member(self, leaf: Leaf, placed: Placed, part: StoredField | None) -> str | None:
         """What a part of a node's field is stored as; None of what shows nothing."""
         bundle = self.whole.draft.bundle
         if part is self.whole.raw[leaf.name]:
             return self.copied(leaf.field)
-        if part is None or part_shown(part, leaf, self.whole.path) is None:
+        if part is None or not placed.crops.grid(part.occupancy).occupied.any():
             return None
         part = registry.kind(part.kind).trimmed(part)
         precision = self.precision or bundle.headers[leaf.field].precision

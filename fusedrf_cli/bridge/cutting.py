@@ -10,9 +10,9 @@ from formats.records import BYTES_PER_NUMBER
 from formats.scene import Leaf, SceneGraph
 from fusedrf_cli.bridge.editing import Draft
 from fusedrf_cli.bridge.memory import ownership, sources
-from fusedrf_cli.bridge.scene import LoadedScene, grouped, make_field, part_shown
+from fusedrf_cli.bridge.scene import LoadedScene, grouped
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.composed import ComposedField, occupied_at
+from fusedrf_cli.engine.composition.composed import ComposedField, shown_at
 from fusedrf_cli.engine.composition.composite import as_composite
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.occupancy import seen_placement, transformed_aabb
@@ -78,8 +78,7 @@ class Whole:
         loaded.field_cache.resize(sum(loaded.sizes))
         whole = cls(draft, loaded, field, origin)
         for leaf, placed in whole.nodes:
-            own = make_field(draft.bundle.field(leaf.field), path) if leaf.crops else placed.field
-            whole.raw[leaf.name] = opened(own)
+            whole.raw[leaf.name] = opened(placed.field)
         return whole
 
     @property
@@ -108,9 +107,8 @@ class Whole:
         for (leaf, placed), source in zip(self.nodes, self.loaded.fields, strict=True):
             part = fields.get(leaf.name)
             if part is not None and part is not self.raw[leaf.name]:
-                part = part_shown(part, leaf, self.path)
-                placed = part and replace(placed, field=part)
-            if part is not None:
+                placed = replace(placed, field=part)
+            if part is not None and placed.occupancy.occupied.any():
                 parts.append(placed)
                 groups.append(source.groups)
         if not parts:
@@ -169,8 +167,7 @@ def nodes_of(whole: Whole, selection: Selection) -> set[str]:
     points = selection.lattice.points[selection.chosen & selection.lattice.dense]
     names = set()
     for leaf, placed in whole.nodes:
-        inverse = np.linalg.inv(whole.object_to_frame(leaf))
-        own = occupied_at(placed.field, points @ inverse[:3, :3].T + inverse[:3, 3])
+        own = shown_at(replace(placed, object_to_world=whole.object_to_frame(leaf)), points)
         if own.mean() > current(CellConfig).aside:
             names.add(leaf.name)
     return names

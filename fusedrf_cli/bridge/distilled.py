@@ -9,7 +9,7 @@ from formats.scene import Leaf, SceneGraph
 from fusedrf_cli.bridge.scene import make_field
 from fusedrf_cli.bridge.sources import leaf_of, source_of
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.composed import occupied_at
+from fusedrf_cli.engine.composition.composed import shown_at
 from fusedrf_cli.engine.kinds.field_cutting import CORNERS
 
 
@@ -42,13 +42,7 @@ class DistilledShape:
         """(N,) bool: which points (N, 3) of the world lie in its source's cells, or in its box."""
         if not self.placed:
             return inside(points, self.box)
-        return np.any([covered(one, points) for one in self.placed], 0)
-
-
-def covered(one: Placed, points: np.ndarray) -> np.ndarray:
-    """(N,) bool: which points (N, 3) of the world lie in the occupied cells of a placed field."""
-    matrix = one.world_to_object
-    return occupied_at(one.field, points @ matrix[:3, :3].T + matrix[:3, 3])
+        return np.any([shown_at(one, points) for one in self.placed], 0)
 
 
 def inside(points: np.ndarray, box: np.ndarray) -> np.ndarray:

@@ -83,7 +83,7 @@ def view_targets(scene: LoadedScene) -> list[ViewTarget]:
     return [
         ViewTarget(
             p.name,
-            placed_box(p.field.occupancy.look_at_box, p.object_to_world),
+            p.aabb,
             camera_set_around(scene, p.name),
         )
         for p in scene.placed

@@ -24,7 +24,13 @@ from fusedrf_cli.bridge.runtime import (
     without_interrupts,
     written_somewhere,
 )
-from fusedrf_cli.bridge.scene import LoadedScene, note_options, refuse_options, unusable_kind
+from fusedrf_cli.bridge.scene import (
+    LoadedScene,
+    cut_to_crops,
+    note_options,
+    refuse_options,
+    unusable_kind,
+)
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.bridge.sources import load_to_fuse
 from fusedrf_cli.bridge.storage_search import StorageSearch, Trial
@@ -67,9 +73,11 @@ def fuse(
         saved = load_checkpoint(request.output, "fuse") if request.resume else None
         memory = Memory(request.memory)
         everything = load(request, memory, device, progress)
+        kind, suits = choose_kind(request.kind, everything, everything.composed())
+        if kind.field is not None or not may_stay_as_it_is(request, everything):
+            everything = cut_to_crops(everything)
         loaded = without_empty(everything, request.scene, progress)
         scene = FuseScene.of(loaded)
-        kind, suits = choose_kind(request.kind, loaded, scene.composed)
         refuse_options(kind, request)
         if kind.field is None:
             note_options(request, loaded, progress)
@@ -183,11 +191,23 @@ def as_it_is(builder: DistilledBuilder, scene: FuseScene) -> Candidate:
     return Candidate(kept, builder, figures)
 
 
+def limit_of(request: FuseRequest, loaded: LoadedScene) -> int:
+    """Bytes of the file, at most."""
+    return request.max_size or current(FusingConfig).default_max_size + unbounded_bytes(loaded)
+
+
+def may_stay_as_it_is(request: FuseRequest, loaded: LoadedScene) -> bool:
+    """Whether the fields of a scene that stay nodes may all keep their bytes."""
+    changes = request.precision or request.ranks or request.sh_degree is not None or request.target_psnr
+    size = unchanged_bytes(loaded)
+    return not changes and size is not None and size <= limit_of(request, loaded)
+
+
 def build_request(request: FuseRequest, scene: FuseScene, overhead: int) -> BuildRequest:
     """What is asked of the kind's student; overhead: bytes of the bundle besides its fields."""
     return BuildRequest(
         sizes=BundleSizes(),
-        limit=request.max_size or current(FusingConfig).default_max_size + unbounded_bytes(scene.loaded),
+        limit=limit_of(request, scene.loaded),
         overhead=overhead,
         target=request.target_psnr,
         precision=request.precision,

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.bundle import BundleWriter
-from formats.graph import placement_of, shown
+from formats.graph import cropped, placement_of, shown
 from formats.records import FieldRecord
 from formats.scene import Node, SceneGraph
 from fusedrf_cli import __version__
@@ -31,13 +31,14 @@ def save_scene(
     of a capture stay where they are in the world. Raises what `BundleWriter.write` and `make_node` raise.
     """
     writer, members, nodes = BundleWriter(), {}, []
+    names = {source.placed.name for source in scene.fields}
     for source in scene.fields:
         name = source.placed.name
         field = fields[name]
         if id(field) not in members:
             members[id(field)] = writer.add_field(FieldRecord(field.kind, *field.state()), precision)
         node = placed_node(name, members[id(field)], placements[name], source.background)
-        nodes.append(shown(node, showing_of(source.placed)))
+        nodes.append(cropped(shown(node, showing_of(source.placed)), source.crops, names))
     history = ()
     if scene.bundle is not None:
         history = scene.graph.history

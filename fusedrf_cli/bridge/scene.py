@@ -11,6 +11,7 @@ import numpy as np
 from formats.bundle import FieldSet, OpenBundle, is_bundle, shared_members
 from formats.errors import FormatError
 from formats.field_header import reading_size
+from formats.nodes import Crop as ShownPart
 from formats.nodes import Leaf, check_affine
 from formats.object_summary import world_aabb
 from formats.records import FieldRecord
@@ -20,6 +21,7 @@ from fusedrf_cli.bridge.field_cache import FieldCache
 from fusedrf_cli.bridge.memory import Memory, sources
 from fusedrf_cli.engine.composition.affine import WHITE, Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.crops import NO_CROPS, Crop, Crops
 from fusedrf_cli.engine.fields.base import FieldMemory, StoredField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placement
 from fusedrf_cli.engine.fields.streamed import StreamedField, opened
@@ -45,8 +47,10 @@ class SourceField:
     needs: FieldMemory
     whole: bool = True
     """Whether it is shown as the bundle has it."""
-    cropped: bool = False
-    """Whether the field is what crops leave of the bundle's."""
+    cut: bool = False
+    """Whether the field is what crops leave of the bundle's, in numbers of its own: see `cut_to_crops`."""
+    crops: tuple[ShownPart, ...] = ()
+    """In its frame."""
     groups: tuple[tuple[str, str], ...] = ()
     """The groups of nodes that it is in which have a rule of their own, from the root down, and their
     rules."""
@@ -195,11 +199,9 @@ def needs_of(bundle: FieldSet, member: str) -> FieldMemory:
     return replace(needs, reading=reading)
 
 
-def grid_of(leaf: Leaf, bundle: FieldSet, member: str) -> OccupancyGrid | None:
-    """The occupancy grid of what a leaf shows of a field, without its other numbers; None where only reading
-    the field tells, or says what is wrong with it."""
-    if leaf.crops:
-        return None
+def stored_grid(bundle: FieldSet, member: str) -> OccupancyGrid | None:
+    """The occupancy grid of a field, without its other numbers; None where only reading the field tells, or
+    says what is wrong with it."""
     header = bundle.headers[member]
     try:
         return registry.kind(header.kind).stored_occupancy(header.metadata, bundle.arrays(member))
@@ -293,10 +295,7 @@ class _Loader:
         """A scene of fields, within the budget."""
         needs = {(bundle, member): needs_of(bundle, member) for _, bundle, member in field_list}
         if self.budget is not None:
-            sizes = {
-                key_of(leaf, member): as_shown_needs(needs[b, member], leaf).resident
-                for leaf, b, member in field_list
-            }
+            sizes = {member: needs[b, member].resident for _, b, member in field_list}
             reading = {"a source while it is read": max(each.reading for each in needs.values())}
             if copied := sum(one.copied for one in {id(one): one for _, one, _ in field_list}.values()):
                 reading["fields of a bundle of an earlier version"] = copied
@@ -304,10 +303,7 @@ class _Loader:
             self.budget.expect(
                 sources([*sizes.values()], self.field_cache.room) | reading, advice="use smaller sources"
             )
-        fields = tuple(
-            self.source(leaf, b, member, as_shown_needs(needs[b, member], leaf))
-            for leaf, b, member in field_list
-        )
+        fields = tuple(self.source(leaf, b, member, needs[b, member]) for leaf, b, member in field_list)
         return LoadedScene(
             fields, graph.composition, graph, self.path, self.field_cache, tuple(self.camera_sets), bundle
         )
@@ -342,83 +338,92 @@ class _Loader:
 
     def source(self, leaf: Leaf, bundle: OpenBundle, member: str, needs: FieldMemory) -> SourceField:
         """leaf: where the field lies, under which name, and what is shown of it."""
-        key = key_of(leaf, member)
+        where = f"{bundle.path}: node '{leaf.name}'"
 
         def read():
-            return self.field_cache.take(key, needs.held, partial(self.field, leaf, bundle, member))
+            return self.field_cache.take(member, needs.held, partial(self.field, bundle, member, where))
 
-        if key not in self.fields:
-            self.fields[key] = StreamedField(read, partial(grid_of, leaf, bundle, member))
-            self.fields[key].kept  # noqa: B018  (read now, so that before any work what is no field is refused)
-        shown = leaf.whole, bool(leaf.crops), leaf.groups
-        return SourceField(self.placed(leaf, bundle, key), leaf.background, bundle, member, needs, *shown)
+        if member not in self.fields:
+            self.fields[member] = StreamedField(read, partial(stored_grid, bundle, member))
+            self.fields[member].kept  # noqa: B018  (read now, so that before any work what is no field is refused)
+        placed = self.placed(leaf, bundle, member)
+        shown = leaf.whole, False, leaf.crops, leaf.groups
+        return SourceField(placed, leaf.background, bundle, member, needs, *shown)
 
     def outline(self, leaf: Leaf, bundle: FieldSet, member: str) -> Placed:
         """The same of a field that is read, and not kept, where its header and its grid do not tell where it
         lies."""
-        key = key_of(leaf, member)
 
         def read():
             needs = needs_of(bundle, member)
             if self.budget is not None:
                 parts = {f"the field of '{leaf.name}'": needs.held + needs.reading}
                 self.budget.expect(parts, advice="allow more by --memory")
-            return self.field(leaf, bundle, member)
+            return self.field(bundle, member, f"{bundle.path}: node '{leaf.name}'")
 
-        if key not in self.fields:
-            self.fields[key] = StreamedField(read, partial(grid_of, leaf, bundle, member))
-        return self.placed(leaf, bundle, key)
+        if member not in self.fields:
+            self.fields[member] = StreamedField(read, partial(stored_grid, bundle, member))
+        return self.placed(leaf, bundle, member)
 
-    def field(self, leaf: Leaf, bundle: FieldSet, member: str) -> StoredField:
-        """What a leaf shows of a field."""
-        where = f"{bundle.path}: node '{leaf.name}'"
-        return cropped(make_field(bundle.field(member), where), leaf, where).to(self.device)
+    def field(self, bundle: FieldSet, member: str, where: str) -> StoredField:
+        """The field of a member."""
+        return make_field(bundle.field(member), where).to(self.device)
 
-    def placed(self, leaf: Leaf, bundle: FieldSet, key: str) -> Placed:
-        """A field where a leaf places it. Raises what says that it cannot."""
+    def placed(self, leaf: Leaf, bundle: FieldSet, member: str) -> Placed:
+        """A field where a leaf places it. Raises what says that it cannot, or that its crops hold nothing of
+        it."""
+        crops = Crops(tuple(Crop.of(crop.shape, crop.object_to_shape) for crop in leaf.crops))
+        field = self.fields[member]
         try:
             check_affine(leaf.object_to_world, f"node '{leaf.name}' in the world")
-            return Placed(leaf.name, self.fields[key], leaf.object_to_world, leaf.opacity, leaf.tint)
+            placed = Placed(leaf.name, field, leaf.object_to_world, leaf.opacity, leaf.tint, crops)
         except FormatError as error:
             raise error.within(str(self.path)) from error
         except ValueError as error:
             raise InvalidInput(f"{bundle.path}: {error}; give an invertible placement") from error
+        if crops and not crops.grid(field.grid).occupied.any():
+            raise nothing_held(f"{bundle.path}: node '{leaf.name}'", field.aabb, leaf.crops[-1])
+        return placed
 
 
-def key_of(leaf: Leaf, member: str) -> str:
-    """What tells fields apart: their numbers, and what crops leave of them."""
-    return f"{member} {leaf.crops}" if leaf.crops else member
+def nothing_held(where: str, box: np.ndarray, crop: ShownPart) -> InvalidInput:
+    """What says that a crop holds nothing of a field of a box (6,)."""
+    lies = ",".join(f"{number:.4g}" for number in world_aabb(box.tolist(), crop.object_to_shape))
+    return InvalidInput(
+        f"{where}: its crop holds nothing of it; in the frame of the node that is cropped it lies within "
+        f"{lies}; give a box or a sphere that reaches into that"
+    )
 
 
-def as_shown_needs(needs: FieldMemory, leaf: Leaf) -> FieldMemory:
-    """What a leaf's field needs: what is cropped is a copy of some of it."""
-    return replace(needs, unwritten=0) if leaf.crops else needs
+def cut_to_crops(loaded: LoadedScene) -> LoadedScene:
+    """The same scene in which each field that is cropped has been cut by its kind, to cells: what is stored
+    anew needs no numbers that nothing shows. InvalidInput where a kind cannot be cut, or nothing is left."""
+    cut: dict[tuple[int, str], StreamedField] = {}
 
+    def after(source: SourceField) -> SourceField:
+        placed, where = source.placed, f"{source.bundle.path}: node '{source.placed.name}'"
+        needs = replace(source.needs, unwritten=0)  # a copy of some of it
 
-def cropped(field: StoredField, leaf: Leaf, where: str) -> StoredField:
-    """As `part_shown`. InvalidInput where that is nothing."""
-    shown = part_shown(field, leaf, where)
-    if shown is None:
-        box = world_aabb(field.aabb.tolist(), leaf.crops[-1].object_to_shape)
-        lies = ",".join(f"{number:.4g}" for number in box)
-        raise InvalidInput(
-            f"{where}: its crop holds nothing of it; in the frame of the node that is cropped it lies within "
-            f"{lies}; give a box or a sphere that reaches into that"
-        )
-    return shown
+        def read() -> StoredField:
+            whole = opened(placed.field)
+            try:
+                part = registry.kind(whole.kind).cropped(whole.to("cpu"), placed.crops.hold)
+            except ValueError as error:
+                raise InvalidInput(f"{where}: {error}") from error
+            if part is None:
+                raise InvalidInput(f"{where}: its crop holds no whole cell of it; give a larger one")
+            return part.to(whole.params.device)
 
+        if not placed.crops:
+            return source
+        key = id(placed.field), repr([crop.to_unit.tolist() for crop in placed.crops.items])
+        if key not in cut:
+            name = f"{source.member} {key[1]}"
+            cut[key] = StreamedField(lambda: loaded.field_cache.take(name, needs.held, read))
+        whole = replace(placed, field=cut[key], crops=NO_CROPS)
+        return replace(source, placed=whole, needs=needs, cut=True, crops=())
 
-def part_shown(field: StoredField, leaf: Leaf, where: str) -> StoredField | None:
-    """What a leaf shows of its field: all of it, or what its crops hold; None where that is nothing.
-    InvalidInput where the kind of field cannot be cropped."""
-    if not leaf.crops:
-        return field
-    try:
-        return registry.kind(field.kind).cropped(
-            field, lambda points: np.all([crop.holds(points) for crop in leaf.crops], 0)
-        )
-    except ValueError as error:
-        raise InvalidInput(f"{where}: {error}") from error
+    return replace(loaded, fields=tuple(map(after, loaded.fields)))
 
 
 def background_of(scene: LoadedScene) -> SourceField:

@@ -13,9 +13,10 @@ from types import ModuleType
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.composition.crops import NO_CROPS, Crops
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.occupancy import seen_placement, squeezed, transformed_aabb
-from fusedrf_cli.engine.fields.streamed import look_at_box
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, seen_placement, squeezed, transformed_aabb
+from fusedrf_cli.engine.fields.streamed import grid_of, look_at_box
 from fusedrf_cli.engine.kernels.reference import exact
 from fusedrf_cli.engine.spaces import bounded
 
@@ -34,6 +35,8 @@ class Placed:
     """Its density is multiplied by this."""
     tint: tuple[float, float, float] = WHITE
     """Its colours are multiplied by these, red, green and blue."""
+    crops: Crops = NO_CROPS
+    """It is empty outside of these, which lie in the object's frame."""
 
     def __post_init__(self):
         """Raises ValueError for a map that is singular or nearly so."""
@@ -55,14 +58,20 @@ class Placed:
 
     @cached_property
     def aabb(self) -> np.ndarray:
-        """(6,) world box around the field's occupied cells, or, where it fills all of space, around the
-        middle of its core."""
-        return transformed_aabb(look_at_box(self.field), self.object_to_world)
+        """(6,) world box around the occupied cells that are shown, or, where it fills all of space, around
+        the middle of its core."""
+        shown = self.crops.grid(grid_of(self.field)).look_at_box if self.crops else look_at_box(self.field)
+        return transformed_aabb(shown, self.object_to_world)
+
+    @property
+    def occupancy(self) -> OccupancyGrid:
+        """The field's, as far as it is shown."""
+        return self.crops.grid(self.field.occupancy)
 
     @cached_property
     def unbounded(self) -> bool:
-        """Whether the field lies in a space without end."""
-        return self.space is not bounded
+        """Whether the field lies in a space without end, and what is shown of it not in a box."""
+        return self.occupancy.space is not bounded
 
     @property
     def space(self) -> ModuleType:
@@ -72,7 +81,7 @@ class Placed:
     @property
     def as_it_is(self) -> bool:
         """Whether its density and its colours are the field's own."""
-        return self.opacity == 1 and tuple(self.tint) == WHITE
+        return self.opacity == 1 and tuple(self.tint) == WHITE and not self.crops
 
     def reaches(self, box: np.ndarray) -> bool:
         """Whether there may be anything of it in a box (6,) of the world."""
@@ -109,12 +118,17 @@ class Placed:
         3) of the world. Not differentiable."""
         x, d, stretch = self.to_object(points, dirs)
         sigma, rgb = self.field.query(x, d, with_colour)
-        return self.shown(sigma.double() * stretch, rgb.float())
+        return self.shown(x, sigma.double() * stretch, rgb.float())
 
-    def shown(self, sigma: torch.Tensor, rgb: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Densities (N,) times its opacity, and colours (N, 3) times its tint."""
+    def shown(
+        self, x: torch.Tensor, sigma: torch.Tensor, rgb: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Densities (N,) at points (N, 3) of the object's frame times its opacity, 0 outside of its crops,
+        and colours (N, 3) times its tint."""
         if self.as_it_is:
             return sigma, rgb
+        if self.crops:
+            sigma = torch.where(self.crops.holds(x.detach()), sigma, 0)
         return sigma * self.opacity, rgb * rgb.new_tensor(self.tint)
 
     def moved(self, origin: np.ndarray) -> "Placed":
@@ -130,6 +144,7 @@ class Placed:
             outer.object_to_world @ self.object_to_world,
             outer.opacity * self.opacity,
             tuple(np.multiply(outer.tint, self.tint).tolist()),
+            self.crops.and_also(outer.crops.within(self.object_to_world)),
         )
 
 

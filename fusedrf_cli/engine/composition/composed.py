@@ -98,9 +98,9 @@ class ComposedField:
         """Cells that any placed field's occupied cells reach. In unbounded space each is sampled as finely as
         those that reach it need: most of it is far from anything that is fine."""
         config = current(OccupancyConfig)
-        grids = ((p.field.occupancy, p.object_to_world) for p in self.placed)
+        grids = ((p.occupancy, p.object_to_world) for p in self.placed)
         if any(p.unbounded for p in self.placed):
-            again = ((p.field.occupancy, p.object_to_world) for p in self.placed)
+            again = ((p.occupancy, p.object_to_world) for p in self.placed)
             steps = (sampling_step(p.field) for p in self.placed)
             pace = StepSizeGrid(OccupancyGrid.full(unbounded.WHOLE, config.scene_cells, unbounded))
             marks = pace.kept(unbounded_cells(grids, config.scene_cells), again, steps)
@@ -114,7 +114,7 @@ class ComposedField:
         if not any(p.unbounded for p in self.placed):
             return self.occupancy.look_at_box
         around = largest(self.placed)
-        return placed_box(around.field.occupancy.look_at_box, around.object_to_world)
+        return placed_box(around.occupancy.look_at_box, around.object_to_world)
 
     @property
     def aabb(self) -> np.ndarray:
@@ -167,15 +167,19 @@ class ComposedField:
 
 def occupied_at(field: RadianceField, points: np.ndarray) -> np.ndarray:
     """(N,) bool: which points (N, 3) of its frame lie in occupied cells of a field, or of one of those that a
-    composed scene places: the cells that each has of its own."""
+    composed scene places: the cells that each has of its own, as far as its crops hold them."""
     field = opened(field)
     if not isinstance(field, ComposedField):
         return field.occupancy.contains(mapped(points, field.occupancy.space))
-    occupied = np.zeros(len(points), bool)
-    for p in field.placed:
-        matrix = p.world_to_object
-        occupied |= occupied_at(p.field, points @ matrix[:3, :3].T + matrix[:3, 3])
-    return occupied
+    return np.any([shown_at(p, points) for p in field.placed], 0)
+
+
+def shown_at(placed: Placed, points: np.ndarray) -> np.ndarray:
+    """`occupied_at` of a placed field, of points (N, 3) of what it is placed in."""
+    matrix = placed.world_to_object
+    own = points @ matrix[:3, :3].T + matrix[:3, 3]
+    occupied = occupied_at(placed.field, own)
+    return occupied & placed.crops.hold(own) if placed.crops else occupied
 
 
 def largest(placed: list[Placed]) -> Placed:

@@ -36,6 +36,7 @@ from fusedrf_cli.engine.kernels.segments import (
     points_in_sphere,
     sort_slots,
 )
+from fusedrf_cli.engine.spaces import bounded
 
 SLOTS_AT_ONCE = 1 << 14  # of which the samples are kept: 20 MB
 
@@ -151,14 +152,16 @@ class Composite(ComposedField):
             np.concatenate(list(skip.values())),
             np.array([sampling_step(field) for field in self.fields]),
             np.stack([sphere_around(p, f) for p, f in zip(self.parts, self.fields, strict=True)]),
-            np.array([self.spaces.index(p.space) if p.unbounded else 0 for p in self.parts], np.int64),
+            np.array([self.spaces.index(p.space) if p.space in self.spaces else -1 for p in self.parts]),
             np.array([(p.opacity, *p.tint) for p in self.parts]),
+            np.cumsum([0, *(len(p.crops.items) for p in self.parts)]),
+            np.array([row for p in self.parts for row in crop_rows(p)]).reshape(-1, 13),
         )
 
     @cached_property
     def spaces(self) -> tuple[ModuleType, ...]:
         """Those without end that instances lie in, by name."""
-        spaces = {p.space for p in self.parts if p.unbounded}
+        spaces = {p.space for p in self.parts if p.space is not bounded}
         return tuple(sorted(spaces, key=lambda space: space.__name__))
 
     @cached_property
@@ -191,10 +194,13 @@ class Composite(ComposedField):
         self, members: np.ndarray, rule: str, points: np.ndarray, dirs: np.ndarray, with_colour: bool
     ) -> PointAnswers:
         """What instances (M,) composed by a rule answer at points (N, 3) along dirs (N, 3)."""
-        matrix, adds, n = self.instances.world_to_instance, rule == "add", len(points)
+        instances, adds, n = self.instances, rule == "add", len(points)
         loops = self.device_loops
         place = loops.on_device
-        query = PointQuery(place(points), place(dirs), None, 0, matrix, self.instances.shown, adds, False)
+        query = PointQuery(
+            place(points), place(dirs), None, 0, instances.world_to_instance, instances.shown,
+            instances.first_crop, instances.crops, adds, False,
+        )  # fmt: skip
         answers = PointAnswers(np.zeros(n), np.full(n, -1), np.empty(n, np.int64), np.zeros((n, 3)))
         answers = place(answers)
         near = {b: self.points_near(points, b) for b in members}
@@ -365,7 +371,7 @@ class Waves:
             part = order[stops[b] : stops[b + 1]]
             slots = Slots(
                 *self.rays, part, ray, instance, *ends, placed.world_to_instance, placed.shown,
-                float(self.steps[b]), float(self.early_stop), self.out,
+                placed.first_crop, placed.crops, float(self.steps[b]), float(self.early_stop), self.out,
             )  # fmt: skip
             scene.fields[b].each(item, slots, len(part), out, RAYS_PER_TASK)
         return order[: stops[0]]
@@ -378,12 +384,21 @@ def room_for_traces(slots: int) -> Traces:
     return Traces(count, np.empty(slots), *reals, cell, cursor, np.empty((slots, 3)))
 
 
+def crop_rows(placed: Placed) -> list[np.ndarray]:
+    """(13,) of each crop of an instance: see kernels/instances.py."""
+    return [
+        np.append((crop.to_unit @ placed.world_to_object)[:3].ravel(), crop.is_ball)
+        for crop in placed.crops.items
+    ]
+
+
 def sphere_around(placed: Placed, field: RadianceField) -> np.ndarray:
-    """(4,) centre and radius of a sphere around the occupied cells of a placed field, without end where they
-    lie in a space without end."""
+    """(4,) centre and radius of a sphere around the occupied cells that are shown of a placed field, without
+    end where it is unbounded."""
     if placed.unbounded:
         return np.array([0, 0, 0, FARTHEST])
-    corners, matrix = box_corners(field.occupancy.tight_aabb(0)), placed.object_to_world
+    shown, matrix = placed.crops.grid(field.occupancy), placed.object_to_world
+    corners = box_corners(shown.look_at_box if placed.crops else shown.tight_aabb(0))
     middle = corners.mean(0) @ matrix[:3, :3].T + matrix[:3, 3]
     radius = np.linalg.norm((corners - corners.mean(0)) @ matrix[:3, :3].T, axis=1).max()
     return np.array([*middle, radius * (1 + 1e-6)])  # by a rounding

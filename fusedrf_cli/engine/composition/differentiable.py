@@ -118,7 +118,7 @@ def placed_query(
     device = device_of(placed.field)
     x, d, stretch = placed.to_object(exact(points, device), dirs.to(device), pose)
     sigma, rgb = query(opened(placed.field), x, d, with_colour=with_colour)
-    return placed.shown((exact(sigma, device) * stretch).to(sigma.dtype), rgb)
+    return placed.shown(x, (exact(sigma, device) * stretch).to(sigma.dtype), rgb)
 
 
 def structure(field: RadianceField, poses: Poses | None) -> RadianceField:
@@ -143,7 +143,7 @@ def bounds(field: RadianceField, poses: Poses | None) -> torch.Tensor:
     corners = []
     for placed in field.placed:
         matrix = exact(poses.get(placed.name, placed.object_to_world), device)
-        inner = exact(box_corners(opened(placed.field).occupancy.tight_aabb(0)), device)
+        inner = exact(box_corners(placed.occupancy.look_at_box), device)
         corners.append(inner @ matrix[:3, :3].T + matrix[:3, 3])
     corners = torch.stack(corners)
     low, high = corners.amin((0, 1)), corners.amax((0, 1))

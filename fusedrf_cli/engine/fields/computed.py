@@ -273,7 +273,7 @@ class ComputedField:
         first, (begin, end) = np.zeros(count, np.int64), np.ascontiguousarray(reach.T)
         slots = Slots(
             exact(rays_o), exact(rays_d), reach, each, each, first, begin, end, np.eye(4)[None, :3],
-            np.ones((1, 4)), float(step), float(early_stop), out,
+            np.ones((1, 4)), np.zeros(2, np.int64), np.empty((0, 13)), float(step), float(early_stop), out,
         )  # fmt: skip
         out[:] = 0
         self.each("show_ray", slots, count, out, RAYS_PER_TASK)

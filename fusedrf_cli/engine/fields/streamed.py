@@ -46,14 +46,19 @@ class StreamedField:
 
     @cached_property
     def look_at_box(self) -> np.ndarray:
-        """(6,) that of its occupancy, for which it is not opened where that can be read without it."""
-        return (self._grid() or self.occupancy).look_at_box
+        """(6,) that of its `grid`."""
+        return self.grid.look_at_box
 
     def query(
         self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """As the opened field's."""
         return self.open().query(points, dirs, with_colour)
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The opened field's, for which it is not opened where that can be read without it."""
+        return self._grid() or self.occupancy
 
     @property
     def occupancy(self) -> OccupancyGrid:
@@ -64,6 +69,11 @@ class StreamedField:
 def opened(field: RadianceField) -> RadianceField:
     """The field itself, read if need be; hold it no longer than it is used."""
     return field.open() if isinstance(field, StreamedField) else field
+
+
+def grid_of(field: RadianceField) -> OccupancyGrid:
+    """The occupancy of a field, read without the field where that can be."""
+    return field.grid if isinstance(field, StreamedField) else field.occupancy
 
 
 def look_at_box(field: RadianceField) -> np.ndarray:

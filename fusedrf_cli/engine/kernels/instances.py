@@ -6,6 +6,11 @@ which begin where the ray does, wherever the ray is cut into *segments*: a segme
 first step has its middle in it. Distances t along rays are those of the scene's frame, whose unit is `length`
 long in an instance's. A *slot* is the segment of one ray and one instance in it.
 
+An instance shows what lies in all of its *crops*, boxes and balls, each of which is a row of 13 numbers: a
+(3, 4) from the scene's frame to one in which it is the cube from -1 to 1 or the unit ball, row by row, and
+whether it is the ball. They are convex, so that a ray is in all of them between two distances, and a slot's
+samples are those of the segment between these: a crop moves none.
+
     show_ray    slots of an instance that is alone: marched, shaded and composited behind what the ray has
     trace_ray   slots of segments where instances meet: the samples of one of them, without their colours
     shade_ray   the colours of those samples by the weights that they were given
@@ -45,8 +50,10 @@ class Instances(NamedTuple):
     skip: object  # flat uint8, see GridArrays
     step: object  # (B,) at which it is sampled, in its own coordinates
     spheres: object  # (B, 4) centre and radius around its occupied cells, in the scene's frame; or infinite
-    space: object  # (B,) int64 of an instance without end its number among the spaces of these; else 0
+    space: object  # (B,) int64, the number of its space among those without end that instances lie in; or -1
     shown: object  # (B, 4) what its density is multiplied by, and its colours: red, green and blue
+    first_crop: object  # (B + 1,) int64, where its crops begin in `crops`, and end where the next one's begin
+    crops: object  # (C, 13), see above
 
 
 class Box(NamedTuple):
@@ -69,6 +76,8 @@ class Slots(NamedTuple):
     end: object  # (N,) float64, where it ends
     world_to_instance: object  # (B, 3, 4)
     shown: object  # (B, 4), see Instances
+    first_crop: object  # (B + 1,), see Instances
+    crops: object  # (C, 13), see Instances
     step: object  # float, in the coordinates of the instance
     early_stop: object  # float, the transmittance at which a ray ends
     rendered: object  # (N, 5) what lies before the segment, as `show_ray` leaves it
@@ -98,6 +107,8 @@ class PointQuery(NamedTuple):
     instance: object  # int
     world_to_instance: object  # (B, 3, 4)
     shown: object  # (B, 4), see Instances
+    first_crop: object  # (B + 1,), see Instances
+    crops: object  # (C, 13), see Instances
     adds: object  # bool: densities add up, and colours by their shares
     with_colour: object  # bool
 
@@ -133,21 +144,77 @@ def ray_in_instance(world_to_instance, b, rays_o, rays_d, r):
     return o, d, math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
 
 
+def in_crop(crops, c, x, y, z):
+    """A point of the scene's frame in that in which crop c is the cube from -1 to 1, or the unit ball; or,
+    without where that frame lies, a direction."""
+    return (
+        crops[c, 0] * x + crops[c, 1] * y + crops[c, 2] * z,
+        crops[c, 4] * x + crops[c, 5] * y + crops[c, 6] * z,
+        crops[c, 8] * x + crops[c, 9] * y + crops[c, 10] * z,
+    )
+
+
+def cropped_between(first_crop, crops, b, rays_o, rays_d, r, begin, end):
+    """From and to which distance, between two, ray r is in all crops of instance b; both are the first where
+    it is nowhere."""
+    low, high = begin, end
+    for c in range(first_crop[b], first_crop[b + 1]):
+        x, y, z = in_crop(crops, c, rays_o[r, 0], rays_o[r, 1], rays_o[r, 2])
+        x, y, z = x + crops[c, 3], y + crops[c, 7], z + crops[c, 11]
+        v = in_crop(crops, c, rays_d[r, 0], rays_d[r, 1], rays_d[r, 2])
+        if crops[c, 12] != 0.0:
+            speed = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+            middle = -(x * v[0] + y * v[1] + z * v[2]) / speed
+            x, y, z = along((x, y, z), v, middle)  # past the centre: exact however far away that is
+            square = (1.0 - (x * x + y * y + z * z)) / speed
+            half = math.sqrt(max(square, 0.0))
+            low, high = max(low, middle - half), min(high, middle + half)
+            if square < 0.0:
+                high = low
+        else:
+            for axis in range(3):
+                p = x if axis == 0 else (y if axis == 1 else z)
+                speed = v[0] if axis == 0 else (v[1] if axis == 1 else v[2])
+                if speed == 0.0:
+                    high = high if abs(p) <= 1.0 else low
+                else:
+                    one, other = (-1.0 - p) / speed, (1.0 - p) / speed
+                    low, high = max(low, min(one, other)), min(high, max(one, other))
+    return (low, high) if low < high else (begin, begin)
+
+
+def is_cropped_away(query, j):
+    """Whether point j lies outside of a crop of the instance."""
+    for c in range(query.first_crop[query.instance], query.first_crop[query.instance + 1]):
+        crops = query.crops
+        x, y, z = in_crop(crops, c, query.points[j, 0], query.points[j, 1], query.points[j, 2])
+        x, y, z = x + crops[c, 3], y + crops[c, 7], z + crops[c, 11]
+        if crops[c, 12] != 0.0:
+            if x * x + y * y + z * z > 1.0:
+                return True
+        elif max(abs(x), max(abs(y), abs(z))) > 1.0:
+            return True
+    return False
+
+
 def slot_ray(slots, s):
-    """The ray of a slot: its number, origin and unit direction in the instance's frame, and how long a unit
-    of the scene's is along it."""
-    r = slots.ray[s]
-    o, d, length = ray_in_instance(slots.world_to_instance, slots.instance[s], slots.rays_o, slots.rays_d, r)
-    return r, o, (d[0] / length, d[1] / length, d[2] / length), length
+    """The ray of a slot: its number, origin and unit direction in the instance's frame, how long a unit of
+    the scene's is along it, and from and to which distance of the scene the instance is followed."""
+    r, b = slots.ray[s], slots.instance[s]
+    o, d, length = ray_in_instance(slots.world_to_instance, b, slots.rays_o, slots.rays_d, r)
+    ends = cropped_between(
+        slots.first_crop, slots.crops, b, slots.rays_o, slots.rays_d, r, slots.begin[r], slots.end[r]
+    )
+    return r, o, (d[0] / length, d[1] / length, d[2] / length), length, ends
 
 
-def samples_between(slots, r, length, warp, t_begin, t_end):
-    """Which samples of a piece from t_begin to t_end lie in the segment of ray r: (where sample 0 is, the
+def samples_between(slots, ends, length, warp, t_begin, t_end):
+    """Which samples of a piece from t_begin to t_end lie between the ends of a slot: (where sample 0 is, the
     number of the first, where they end). Both ends go by the numbers of samples, so that of two segments that
     touch every sample is in one, and none of them stands for less than it does in the whole ray."""
-    step, end = slots.step, length_at(warp, slots.end[r] * length)
+    step, end = slots.step, length_at(warp, ends[1] * length)
     t_begin = t_begin + 0.5 * step
-    first = math.ceil((min(length_at(warp, slots.begin[r] * length), t_end) - t_begin) / step)
+    first = math.ceil((min(length_at(warp, ends[0] * length), t_end) - t_begin) / step)
     if end < t_end:
         t_end = t_begin + (math.ceil((end - t_begin) / step) - 0.5) * step
     return t_begin, max(0, int(first)), t_end
@@ -161,7 +228,7 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
     shaded: the next one that is lends them its colour, at the end of the segment the last one.
     """
     s = slots.chosen[i]
-    r, o, d, length = slot_ray(slots, s)
+    r, o, d, length, ends = slot_ray(slots, s)
     step, far, shown = slots.step, slots.reach[r, 1] * length, slots.shown[slots.instance[s]]
     thick = shown[0]
     red, green, blue, depth = 0.0, 0.0, 0.0, 0.0
@@ -174,7 +241,7 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
         (origin, direction, t_begin, t_end, warp), piece_begin = next_piece(piece_begin, grid, o, d, far)
         if t_end <= t_begin:
             continue
-        t_begin, index, t_end = samples_between(slots, r, length, warp, t_begin, t_end)
+        t_begin, index, t_end = samples_between(slots, ends, length, warp, t_begin, t_end)
         index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, index)
         while index >= 0 and trans > slots.early_stop:
             t_local = t_begin + 0.5 * midpoint(index, n_steps) * step
@@ -211,7 +278,7 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
 def trace_ray(field, grid, slots, i, scratch, memory, out):
     """The samples of slot chosen[i] that are not empty, up to where they alone would leave no light."""
     s = slots.chosen[i]
-    r, o, d, length = slot_ray(slots, s)
+    r, o, d, length, ends = slot_ray(slots, s)
     step, far, thick = slots.step, slots.reach[r, 1] * length, slots.shown[slots.instance[s], 0]
     trans, count, complete = 1.0 - slots.rendered[r, 3], 0, FARTHEST
     piece_begin = first_piece_at(o, d, slots.reach[r, 0] * length)
@@ -221,7 +288,7 @@ def trace_ray(field, grid, slots, i, scratch, memory, out):
         (origin, direction, t_begin, t_end, warp), piece_begin = next_piece(piece_begin, grid, o, d, far)
         if t_end <= t_begin:
             continue
-        t_begin, index, t_end = samples_between(slots, r, length, warp, t_begin, t_end)
+        t_begin, index, t_end = samples_between(slots, ends, length, warp, t_begin, t_end)
         index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, index)
         while index >= 0 and trans > slots.early_stop and count < MAX_TRACED:
             t_local = t_begin + 0.5 * midpoint(index, n_steps) * step
@@ -251,7 +318,7 @@ def shade_ray(field, grid, slots, i, scratch, memory, out):
     """The colours of the samples of slot chosen[i] that show, by their weights; light ones as in
     `show_ray`."""
     s = slots.chosen[i]
-    _, o, d, length = slot_ray(slots, s)
+    _, o, d, length, _ = slot_ray(slots, s)
     shown = slots.shown[slots.instance[s]]
     red, green, blue = 0.0, 0.0, 0.0
     c_r, c_g, c_b = 0.0, 0.0, 0.0
@@ -296,7 +363,7 @@ def densest_at(field, grid, query, i, scratch, memory, out):
     """Enter an instance's density at point chosen[i] where it is the densest so far, or add it."""
     j = query.chosen[i]
     p, d, times = point_in_instance(field, grid, query, i)
-    if is_inside(field, grid, p):
+    if is_inside(field, grid, p) and not is_cropped_away(query, j):
         sigma, _, strides, cell = density(field, grid, 0, p, d, scratch)
         sigma *= times
         if strides > 0 and query.adds:
@@ -311,7 +378,7 @@ def colour_at(field, grid, query, i, scratch, memory, out):
     j, share, shown = query.chosen[i], 1.0, query.shown[query.instance]
     p, d, times = point_in_instance(field, grid, query, i)
     if query.adds:
-        if not is_inside(field, grid, p):
+        if not is_inside(field, grid, p) or is_cropped_away(query, j):
             return
         sigma, _, strides, cell = density(field, grid, 0, p, d, scratch)
         if strides == 0 or sigma <= 0.0:

@@ -44,7 +44,9 @@ class Groups(NamedTuple):
 
 
 next_in_box, next_in_space = (loops_for(None, (), s).names["next_change"] for s in (bounded, unbounded))
-ray_in_instance = loops_for(None, (), bounded).names["ray_in_instance"]
+ray_in_instance, cropped_between = (
+    loops_for(None, (), bounded).names[name] for name in ("ray_in_instance", "cropped_between")
+)
 
 
 # -- the next segment of a ray -------------------------------------------------------------------------------
@@ -52,10 +54,14 @@ ray_in_instance = loops_for(None, (), bounded).names["ray_in_instance"]
 
 @device
 def next_on_ray(rays, instances, b, r, begin, end, gaps):
-    """`next_change` of instance b on ray r, for a gap of so many of its steps, and how long a step is."""
+    """`next_change` of instance b in its crops on ray r, for a gap of so many of its steps, and how long a
+    step is."""
     o, d, length = ray_in_instance(instances.world_to_instance, b, rays.rays_o, rays.rays_d, r)
     step = instances.step[b] / length
-    if instances.spheres[b, 3] >= FARTHEST:
+    begin, end = cropped_between(
+        instances.first_crop, instances.crops, b, rays.rays_o, rays.rays_d, r, begin, end
+    )
+    if instances.space[b] >= 0:
         return next_in_space(instances, b, o, d, begin, end, gaps * step), step
     return next_in_box(instances, b, o, d, begin, end, gaps * step), step
 

@@ -294,7 +294,7 @@ def test_no_sample_lies_before_the_next_change_or_behind_the_last(space):
     instances = Instances(
         np.eye(4)[None, :3], grid.aabb[None, :3], grid.aabb[None, 3:], grid.cell[None],
         np.array([grid.occupied.shape]), np.zeros(1, np.int64), grid.skip.ravel(), np.array([step]), zeros,
-        np.zeros(1, np.int64), np.ones((1, 4)),
+        np.zeros(1, np.int64), np.ones((1, 4)), np.zeros(2, np.int64), np.empty((0, 13)),
     )  # fmt: skip
     for o, d in rays_of(space, 40):
         d = d / np.linalg.norm(d)
