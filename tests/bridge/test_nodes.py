@@ -10,7 +10,7 @@ import torch
 from formats.bundle import FieldSet, OpenBundle, read_bundle
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.field_bundle import write_field
-from fusedrf_cli.bridge.scene import grid_of, load_scene, make_field
+from fusedrf_cli.bridge.scene import load_scene, make_field, stored_grid
 from tests.bridge.conftest import done, invoke
 from tests.engine.conftest import BOX
 from tests.engine.kinds.cases import random_boxed, random_vm
@@ -90,8 +90,8 @@ def test_an_edit_changes_the_graph_alone_and_is_undone_to_the_bit(folder, report
     assert (folder / "four.rfpack").read_bytes() == before
 
 
-READ = {"crop": {"sparse"}, "replace": {"dense"}, "add": {"cp"}}
-"""Kinds of the fields that an edit reads: what it cuts, and what it brings. No other edit reads any."""
+READ = {"replace": {"dense"}, "add": {"cp"}}
+"""Kinds of the fields that an edit reads: what it brings. No other edit reads any."""
 
 
 @pytest.mark.parametrize("verb", EDITS)
@@ -126,7 +126,7 @@ def record_of_reading(monkeypatch) -> list[str]:
 def test_where_a_field_lies_is_told_by_its_grid_alone(folder, kind):
     bundle = OpenBundle(folder / f"{kind}.rfpack")
     (leaf,) = bundle.scene.leaves()
-    grid = grid_of(leaf, bundle, leaf.field)
+    grid = stored_grid(bundle, leaf.field)
     whole = make_field(bundle.field(leaf.field), kind).occupancy
     assert grid.space is whole.space and np.array_equal(grid.look_at_box, whole.look_at_box)
     assert np.array_equal(grid.occupied, whole.occupied) and np.array_equal(grid.aabb, whole.aabb)

@@ -8,7 +8,7 @@ import torch
 
 from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge.scene import background_of, grouped, load_scene
+from fusedrf_cli.bridge.scene import background_of, cut_to_crops, grouped, load_scene
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
@@ -109,19 +109,25 @@ def test_a_source_that_is_replaced_meanwhile_is_read_as_it_was(folder, tmp_path)
         assert opened(placed.field).params.equal(params)
 
 
-def test_nodes_that_show_a_field_differently_each_count(folder):
-    """A field that is cropped has numbers of its own: so many take so many times the memory. Tints and
-    opacities are the nodes', which share the field."""
+def test_nodes_that_show_a_field_differently_share_it(folder):
+    """Crops, tints and opacities are the nodes'. Only where a field is cut to its crop, to be stored anew,
+    are there as many as there are crops."""
     red = make_node("n", source="red.rfpack")
-    shown = {"cropped": lambda i: {"crop": [0, 0, 0, 0.1 * i]}}
-    shown["shared"] = lambda i: {"opacity": 0.1 * i, "tint": [0.1 * i, 1, 1]}
-    for name, showing in shown.items():
-        nodes = [replace(red, name=f"n{i}", showing=showing(i)) for i in range(2, 9)]
-        write_scene(folder / f"{name}.json", SceneGraph(tuple(nodes)))
-    assert len(load_scene(str(folder / "cropped.json")).sizes) == 7
+
+    def showing(i: int) -> dict:
+        return {"opacity": 0.1 * i, "tint": [0.1 * i, 1, 1], "crop": [0, 0, 0, 0.05 * (i // 2)]}
+
+    nodes = [replace(red, name=f"n{i}", showing=showing(i)) for i in range(4, 10)]
+    write_scene(folder / "shared.json", SceneGraph(tuple(nodes)))
     assert len(load_scene(str(folder / "scene.json")).sizes) == 3
     shared = load_scene(str(folder / "shared.json"))
-    assert len(shared.sizes) == 1 and len({p.tint for p in shared.placed}) == 7
+    assert len(shared.sizes) == 1 and len({p.tint for p in shared.placed}) == 6
+    cut = cut_to_crops(shared)
+    assert len(cut.sizes) == 3 and not any(p.crops for p in cut.placed)
+    whole, parts = opened(shared.placed[0].field), [opened(p.field) for p in cut.placed]
+    corner = torch.tensor([[0.2, 0.2, 0.2]]).double(), torch.tensor([[0.0, 0.0, 1.0]]).double()
+    assert whole.query(*corner)[0] > 1 and all(part.query(*corner)[0] == 0 for part in parts)
+    assert parts[0] is parts[1]
 
 
 class Fog:

@@ -188,8 +188,8 @@ class Kind:
         return field_cutting.cut_away(self.on_one_grid(field), selection)
 
     def cropped(self, field: StoredField, holds: Holds) -> StoredField | None:
-        """What of a field lies in cells that lie wholly where `holds` says so, with the numbers that it has;
-        None where there is nothing. Raises ValueError as `cut_out`."""
+        """What of a field lies in cells that lie wholly where `holds` says so, with the numbers that it has,
+        for those to be stored anew; None where there is nothing. Raises ValueError as `cut_out`."""
         return field_cutting.crop_of(self.on_one_grid(field), field.box, holds)
 
     def restricted(self, field: StoredField, holds: Holds) -> StoredField | None:
