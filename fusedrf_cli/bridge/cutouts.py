@@ -51,7 +51,7 @@ class Cutout:
         bundle = self.whole.draft.bundle
         if part is self.whole.raw[leaf.name]:
             return self.copied(leaf.field)
-        if part is None or not placed.crops.grid(part.occupancy).occupied.any():
+        if part is None or not placed.crops.cells_of(part.occupancy).occupied.any():
             return None
         part = registry.kind(part.kind).trimmed(part)
         precision = self.precision or bundle.headers[leaf.field].precision

@@ -66,7 +66,7 @@ class Draft:
 
     def box_in(self, graph: SceneGraph, names: Container[str] | None = None) -> np.ndarray | None:
         """(6,) in the world around what leaves of such names show, None: all, of a graph over these fields;
-        None where that is nothing. Headers and grids tell it, but of what crops leave of a field."""
+        None where that is nothing. Headers and grids tell it."""
         placed = outlines(self.fields, graph, self.memory, self.outlined)
         boxes = [one.aabb for one in placed if names is None or belongs(one.name, names)]
         return enclosing(boxes) if boxes else None

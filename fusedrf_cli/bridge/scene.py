@@ -381,7 +381,7 @@ class _Loader:
             raise error.within(str(self.path)) from error
         except ValueError as error:
             raise InvalidInput(f"{bundle.path}: {error}; give an invertible placement") from error
-        if crops and not crops.grid(field.grid).occupied.any():
+        if crops and not placed.occupancy.occupied.any():
             raise nothing_held(f"{bundle.path}: node '{leaf.name}'", field.aabb, leaf.crops[-1])
         return placed
 

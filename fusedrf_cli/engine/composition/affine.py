@@ -16,7 +16,7 @@ import torch
 from fusedrf_cli.engine.composition.crops import NO_CROPS, Crops
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, seen_placement, squeezed, transformed_aabb
-from fusedrf_cli.engine.fields.streamed import grid_of, look_at_box
+from fusedrf_cli.engine.fields.streamed import look_at_box
 from fusedrf_cli.engine.kernels.reference import exact
 from fusedrf_cli.engine.spaces import bounded
 
@@ -60,13 +60,13 @@ class Placed:
     def aabb(self) -> np.ndarray:
         """(6,) world box around the occupied cells that are shown, or, where it fills all of space, around
         the middle of its core."""
-        shown = self.crops.grid(grid_of(self.field)).look_at_box if self.crops else look_at_box(self.field)
+        shown = self.occupancy.look_at_box if self.crops else look_at_box(self.field)
         return transformed_aabb(shown, self.object_to_world)
 
     @property
     def occupancy(self) -> OccupancyGrid:
         """The field's, as far as it is shown."""
-        return self.crops.grid(self.field.occupancy)
+        return self.crops.shown(self.field) if self.crops else self.field.occupancy
 
     @cached_property
     def unbounded(self) -> bool:

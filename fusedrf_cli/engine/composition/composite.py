@@ -397,8 +397,8 @@ def sphere_around(placed: Placed, field: RadianceField) -> np.ndarray:
     end where it is unbounded."""
     if placed.unbounded:
         return np.array([0, 0, 0, FARTHEST])
-    shown, matrix = placed.crops.grid(field.occupancy), placed.object_to_world
-    corners = box_corners(shown.look_at_box if placed.crops else shown.tight_aabb(0))
+    grid, matrix = field.occupancy, placed.object_to_world
+    corners = box_corners(placed.occupancy.look_at_box if placed.crops else grid.tight_aabb(0))
     middle = corners.mean(0) @ matrix[:3, :3].T + matrix[:3, 3]
     radius = np.linalg.norm((corners - corners.mean(0)) @ matrix[:3, :3].T, axis=1).max()
     return np.array([*middle, radius * (1 + 1e-6)])  # by a rounding

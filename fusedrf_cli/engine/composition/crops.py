@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, box_corners, mapped
+from fusedrf_cli.engine.fields.streamed import grid_of
 from fusedrf_cli.engine.kernels.reference import OCTANTS
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded
@@ -63,7 +65,7 @@ class Crops:
 
     def __init__(self, items: tuple[Crop, ...] = ()):
         self.items = items
-        self._known: tuple[OccupancyGrid, OccupancyGrid] | None = None
+        self._shown: tuple[RadianceField, OccupancyGrid] | None = None
 
     def __bool__(self) -> bool:
         return bool(self.items)
@@ -94,17 +96,17 @@ class Crops:
         low, high = boxes[:, :3].max(0), boxes[:, 3:].min(0)
         return np.concatenate([np.minimum(low, high), high])
 
-    def grid(self, grid: OccupancyGrid) -> OccupancyGrid:
+    def shown(self, field: RadianceField) -> OccupancyGrid:
+        """`cells_of` a field's occupancy, found once, without reading the field where that can be."""
+        if self._shown is None or self._shown[0] is not field:
+            self._shown = field, self.cells_of(grid_of(field))
+        return self._shown[1]
+
+    def cells_of(self, grid: OccupancyGrid) -> OccupancyGrid:
         """A field's occupancy as far as it is shown: the cells that all of them reach into. Where they lie in
         that part of a space without end whose coordinates are those of the frame, it is that of a box."""
         if not self:
             return grid
-        if self._known is None or self._known[0] is not grid:
-            self._known = grid, self._grid(grid)
-        return self._known[1]
-
-    def _grid(self, grid: OccupancyGrid) -> OccupancyGrid:
-        """See `grid`."""
         around = self.aabb
         index, kept, space = np.argwhere(grid.occupied), np.zeros_like(grid.occupied), grid.space
         low, high = [around[:3]], [around[3:]]

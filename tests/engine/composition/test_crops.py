@@ -115,7 +115,7 @@ def test_a_shape_holds_what_its_numbers_say(shape):
 @pytest.mark.parametrize("crops", EACH)
 def test_cells_that_are_shown_are_those_with_points_in_the_crops(field, crops):
     field, crops = FIELDS[field](), EACH[crops]
-    shown = crops.grid(field.occupancy)
+    shown = crops.shown(field)
     points = points_in(np.array([-0.99, -0.99, -0.99, 0.99, 0.99, 0.99]), 20000)
     there = crops.hold(points) & field.occupancy.contains(points)
     assert there.sum() > 50 and shown.contains(points[there]).all()
@@ -126,7 +126,7 @@ def test_cells_that_are_shown_are_those_with_points_in_the_crops(field, crops):
     away = np.linalg.norm(shown.cell)
     beside = ~crops.hold(points) & np.all([~near(crops, points, away)], 0)
     assert not shown.contains(points[beside]).any()
-    assert crops.grid(field.occupancy) is shown
+    assert crops.shown(field) is shown
 
 
 def near(crops: Crops, points: np.ndarray, away: float) -> np.ndarray:
