@@ -112,6 +112,17 @@ def edited(path: Path, words: tuple[str, ...], output: Path) -> dict:
     return json.loads(result.stdout)
 
 
+def told_for_sure(
+    case: Case, points: np.ndarray, dirs: np.ndarray, sigma: np.ndarray, folder: Path
+) -> np.ndarray:
+    """(N,) bool: at which points the bundles that may answer as this one does answer as it does, σ (N,)."""
+    same = np.ones(len(sigma), bool)
+    for make in case.others:
+        make(folder)
+        same &= answers(folder / "kept.rfpack", points, dirs)[0] == sigma
+    return same
+
+
 def asked(path: Path, case: Case, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Points (POINTS, 3) of a case's box, half of them in matter, and unit directions."""
     rng, box = np.random.default_rng(5), np.array(case.box)
@@ -120,10 +131,7 @@ def asked(path: Path, case: Case, folder: Path) -> tuple[np.ndarray, np.ndarray]
     dirs = rng.normal(size=points.shape)
     dirs /= np.linalg.norm(dirs, axis=1, keepdims=True)
     sigma = answers(path, points, dirs)[0]
-    there, same = sigma > 0, np.ones(len(sigma), bool)
-    for make in case.others:
-        make(folder)
-        same &= answers(folder / "kept.rfpack", points, dirs)[0] == sigma
+    there, same = sigma > 0, told_for_sure(case, points, dirs, sigma, folder)
     points, dirs, there = points[same], dirs[same], there[same]
     kept = np.sort(
         np.concatenate([np.flatnonzero(there)[: POINTS // 2], np.flatnonzero(~there)[: POINTS // 2]])
