@@ -416,7 +416,7 @@ def cut_to_crops(loaded: LoadedScene) -> LoadedScene:
 
         if not placed.crops:
             return source
-        key = id(placed.field), repr([crop.to_unit.tolist() for crop in placed.crops.items])
+        key = id(placed.field), repr([(c.is_ball, c.to_unit.tolist()) for c in placed.crops.items])
         if key not in cut:
             name = f"{source.member} {key[1]}"
             cut[key] = StreamedField(lambda: loaded.field_cache.take(name, needs.held, read))
