@@ -18,8 +18,9 @@ SLOW ?=
 ORDER ?=
 SCENE ?=
 SHARE ?= 1
+MITSUBA ?=
 
-.PHONY: help demo test test-order test-slow fuzz docs lint bench bench-paper bench-real stability clean
+.PHONY: help demo test test-order test-slow fuzz docs lint bench bench-paper bench-real bench-splats stability clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -53,6 +54,7 @@ docs: $(VENV)  ## docs/commands.md, out of --help
 
 lint: $(VENV)  ## ruff
 	$(PYTHON) -m ruff check .
+	$(PYTHON) -m ruff format --check .
 
 bench: $(VENV)  ## the measurements that the claims rest on; DATA= a folder with bear/, chair/ and fuze/: full frames too
 	$(PYTHON) -m benchmarks
@@ -65,6 +67,9 @@ bench-real: $(VENV)  ## real captures: docs/real; DATA= a folder of captures, SH
 	$(PYTHON) -m benchmarks.real $(DATA) --share $(SHARE)
 	$(PYTHON) -m benchmarks.placed $(DATA) --share $(SHARE)
 	$(PYTHON) -m benchmarks.extraction $(DATA) --share $(SHARE)
+
+bench-splats: $(VENV)  ## splats as fields, alone and among other systems' fields on a park; DATA= a folder with splats/, bear/ and foreign/, MITSUBA= a Python that has Mitsuba
+	$(PYTHON) -m benchmarks.splats $(DATA) $(if $(MITSUBA),--mitsuba $(MITSUBA))
 
 stability: $(VENV)  ## the failure suite at length: docs/stability.md and its chart
 	mkdir -p build
