@@ -16,7 +16,6 @@ SEED ?= 0
 
 SLOW ?=
 ORDER ?=
-SCENE ?=
 SHARE ?= 1
 MITSUBA ?=
 
@@ -24,7 +23,7 @@ MITSUBA ?=
 .DEFAULT_GOAL := help
 
 help:  ## this list
-	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
 
 demo: $(VENV)  ## two small scenes, fused and rendered
 	$(PYTHON) examples/demo.py
@@ -52,7 +51,7 @@ fuzz: $(VENV)  ## 10,000 hostile packs, captures and meshes, 1,000 by whole comm
 docs: $(VENV)  ## docs/commands.md, out of --help
 	$(PYTHON) -m docs.commands
 
-lint: $(VENV)  ## ruff
+lint: $(VENV)  ## ruff, rules and format
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 
