@@ -3,8 +3,8 @@
 Says how long each file took. With --third only a third of the files runs: which one follows from the number
 of commits, so that three commits one after the other run all of them. With --minutes nothing runs longer than
 that: a file that may not end in time does not begin, and one that is still running then is stopped, which is
-said. The exit code is 1 where a test failed, and 0 where none did that was reached. --save keeps the seconds in slow.json, by which thirds are of equal length and the longest begin
-first.
+said. The exit code is 1 where a test failed, and 0 where none did that was reached. --save keeps the seconds
+in slow.json, by which thirds are of equal length and the longest begin first.
 """
 
 import argparse
