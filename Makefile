@@ -19,7 +19,7 @@ ORDER ?=
 SCENE ?=
 SHARE ?= 1
 
-.PHONY: help demo test test-order test-slow fuzz docs lint bench bench-paper bench-real stability clean
+.PHONY: help demo test test-order test-slow fuzz docs lint bench bench-paper bench-real bench-table1 stability clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -65,6 +65,9 @@ bench-real: $(VENV)  ## real captures: docs/real; DATA= a folder of captures, SH
 	$(PYTHON) -m benchmarks.real $(DATA) --share $(SHARE)
 	$(PYTHON) -m benchmarks.placed $(DATA) --share $(SHARE)
 	$(PYTHON) -m benchmarks.extraction $(DATA) --share $(SHARE)
+
+bench-table1: $(VENV)  ## every kind on the same scenes: docs/table1.md; DATA= a folder with chair/, fox/, bear/ and fuze/, SHARE= for less time
+	$(PYTHON) -m benchmarks.table1 $(DATA) --share $(SHARE)
 
 stability: $(VENV)  ## the failure suite at length: docs/stability.md and its chart
 	mkdir -p build
