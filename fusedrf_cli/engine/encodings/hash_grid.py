@@ -85,7 +85,7 @@ def sections(
 ) -> list[ParameterBlock]:
     """See encodings. Drawn as in the paper (sec. 4), but normal."""
     rows = sum(level["rows"] for level in levels)
-    return [ParameterBlock("rows", (rows, features), spread=1e-4)]
+    return [ParameterBlock("rows", (rows, features), spread=1e-4, fades=True)]
 
 
 def arrays(field, starts: np.ndarray, features: int, levels: list[dict], grows: bool = False) -> Arrays:

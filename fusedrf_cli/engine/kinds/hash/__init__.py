@@ -7,6 +7,8 @@ from fusedrf_cli.engine.kinds.box_kind import BoxKind
 from fusedrf_cli.engine.kinds.builder import StorageSetting
 from fusedrf_cli.engine.kinds.hash.field import BASE, HashField, HashShape
 
+MOST_ROWS = 19  # log2, of a level: a step looks through the gradients of all
+
 
 class HashKind(BoxKind):
     """See Kind."""
@@ -16,10 +18,11 @@ class HashKind(BoxKind):
     field = HashField
 
     def shape_at(self, storage: StorageSetting, resolution: tuple[int, int, int]) -> object:
-        """See BoxKind: levels up to FINER vertices on a texel, of as many rows at most as a plane of texels
-        has."""
+        """See BoxKind: levels up to FINER vertices on a texel, of four times as many rows at most as a plane of
+        texels has."""
         longest = max(resolution)
-        return HashShape(finest=max(FINER * longest, BASE), log2_rows=round(2 * math.log2(longest)))
+        log2_rows = min(round(2 * math.log2(longest)) + 2, MOST_ROWS)
+        return HashShape(finest=max(FINER * longest, BASE), log2_rows=log2_rows)
 
 
 KIND = HashKind()

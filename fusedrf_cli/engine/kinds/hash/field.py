@@ -18,8 +18,8 @@ BASE = 16  # vertices along an axis of the coarsest level
 class HashConfig:
     """How such a field learns; rates are relative to the optimiser's."""
 
-    rows_rate: float = 0.5
-    density_rate: float = 0.1
+    rows_rate: float = 2.0
+    density_rate: float = 1.0
     network_rate: float = 0.1
 
 
