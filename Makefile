@@ -19,7 +19,7 @@ ORDER ?=
 SHARE ?= 1
 MITSUBA ?=
 
-.PHONY: help demo test test-order test-slow fuzz docs lint bench bench-paper bench-real bench-splats stability clean
+.PHONY: help demo test test-order test-slow fuzz docs lint bench bench-paper bench-real bench-splats bench-table1 stability clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -69,6 +69,9 @@ bench-real: $(VENV)  ## real captures: docs/real; DATA= a folder of captures, SH
 
 bench-splats: $(VENV)  ## splats as fields, alone and among other systems' fields on a park; DATA= a folder with splats/, bear/ and foreign/, MITSUBA= a Python that has Mitsuba
 	$(PYTHON) -m benchmarks.splats $(DATA) $(if $(MITSUBA),--mitsuba $(MITSUBA))
+
+bench-table1: $(VENV)  ## every kind on the same scenes: docs/table1.md; DATA= a folder with chair/, fox/, bear/ and fuze/, SHARE= for less time
+	$(PYTHON) -m benchmarks.table1 $(DATA) --share $(SHARE)
 
 stability: $(VENV)  ## the failure suite at length: docs/stability.md and its chart
 	mkdir -p build

@@ -236,7 +236,7 @@ def test_an_interrupted_fuse_goes_on(run, folder, monkeypatch):
         (("scene.json", "--resume", "--kind", "vm"), 3, "no checkpoint"),
         (("nowhere.json",), 3, "no such file"),
         (("scene.json", "--device", "cuda"), 5, "no GPU"),
-        (("scene.json", "--kind", "hash"), 2, "hash"),
+        (("scene.json", "--kind", "voxels"), 2, "voxels"),
     ],
 )
 def test_what_cannot_be_fused(run, folder, words, code, says):
