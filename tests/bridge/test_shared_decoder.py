@@ -115,12 +115,8 @@ def test_a_checkpoint_of_other_sources_is_refused(run, folder, interrupted_in_st
         result = run(*words, "--resume")
         assert result.exit_code == 3 and "other settings" in result.stderr
     runs = state["runs"]
-    for wrong in (
-        state | {"runs": {"0": runs["0"]}},
-        state | {"runs": runs | {"1": {}}},
-        state | {"runs": 3},
-    ):
-        write_checkpoint(folder / "out.rfpack.checkpoint", arrays, wrong)
+    for wrong in ({"0": runs["0"]}, runs | {"1": {}}, 3):
+        write_checkpoint(folder / "out.rfpack.checkpoint", arrays, state | {"runs": wrong})
         result = run(*WORDS, "--resume")
         assert result.exit_code == 3 and "other settings" in result.stderr
 
@@ -154,7 +150,10 @@ def test_a_time_budget_is_that_of_both(report, in_force):
 @pytest.mark.parametrize(
     "words, says",
     [
-        (("--kind", "vm"), "--kind vm has no decoder that fields can share; with --shared-decoder take "),
+        (
+            ("--kind", "vm"),
+            "--kind vm has no decoder that fields can share; with --shared-decoder take dense-mlp",
+        ),
         (("--kind", "cp"), "--kind cp has no decoder"),
         (("--sh-degree", "1"), "--sh-degree does not apply to kind 'dense-mlp'"),
         (("--ranks", "8,8"), "--ranks does not apply"),
@@ -164,7 +163,6 @@ def test_what_cannot_be_shared_is_refused(run, folder, monkeypatch, words, says)
     monkeypatch.setattr(FitRun, "start", lambda *_: pytest.fail(NO_RUN))
     result = run(*WORDS, *words)
     assert result.exit_code == 2 and says in result.stderr and result.stderr.count("\n") == 1
-    assert ("dense-mlp" in result.stderr) == ("no decoder" not in says or "take" in says) or "cp" in words
     assert not (folder / "out.rfpack").exists()
 
 
@@ -199,8 +197,7 @@ EDITS = {
 @pytest.mark.parametrize("verb", EDITS)
 def test_edits_keep_what_is_shared_stored_once(report, run, folder, verb):
     before = members(folder / "two.rfpack")
-    given = (EDITS[verb][0], *EDITS[verb][1:])
-    report(verb, "two.rfpack", *given, "-o", "more.rfpack")
+    report(verb, "two.rfpack", *EDITS[verb], "-o", "more.rfpack")
     fields, shared = members(folder / "more.rfpack")
     assert shared == before[1] and set(before[0]) <= set(fields)
     assert run("validate", "more.rfpack").exit_code == 0
