@@ -93,6 +93,6 @@ def command(**words):
     \b
     Example:
       fusedrf train photos/ -o chair.rfpack
-      fusedrf train chair/ table.glb lamp.glb --shared-decoder -o furniture.rfpack
+      fusedrf train photos/ table.glb --shared-decoder -o both.rfpack
     """
     return verbs.train(**words)
