@@ -200,6 +200,10 @@ def plan(
     suits = current(TrainPresets).unbounded_precision if unbounded else "float16"
     about = kept_with(sources)
     check_graph(request.output, {source.name: source.bounds.origin for source in sources}, about)
+    if about.cameras is None and sum(source.camera_content is not None for source in sources) > 1:
+        sources[0].progress.tell(
+            f"{request.output}: its nodes are of several captures, so that it keeps the cameras of none"
+        )
     besides = camera_bytes(about.cameras)
     for source in sources:
         try:

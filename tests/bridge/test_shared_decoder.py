@@ -50,6 +50,7 @@ def test_both_fields_show_their_captures_by_one_decoder(made, report, run, folde
         assert own["training_psnr"] > 20 and own["holdout"]["psnr"] > 20
     fields, shared = members(folder / "two.rfpack")
     assert len(fields) == 2 and len(shared) == 1
+    assert read_bundle(folder / "two.rfpack").scene.cameras is None  # those of which capture?
     decoders = [
         {name: array for name, array in record.arrays.items() if name.startswith("decoder.")}
         for record in read_bundle(folder / "two.rfpack").fields.values()
@@ -66,7 +67,9 @@ def test_both_fields_show_their_captures_by_one_decoder(made, report, run, folde
 
 
 def test_a_report_for_people_has_a_part_for_each(run):
-    said = run(*WORDS).stdout
+    result = run(*WORDS)
+    assert "it keeps the cameras of none" in result.stderr
+    said = result.stdout
     assert "\n  photos:\n" in said and "\n  bluish:\n" in said and said.count("training psnr: ") == 2
 
 
@@ -164,6 +167,13 @@ def test_what_cannot_be_shared_is_refused(run, folder, monkeypatch, words, says)
     result = run(*WORDS, *words)
     assert result.exit_code == 2 and says in result.stderr and result.stderr.count("\n") == 1
     assert not (folder / "out.rfpack").exists()
+
+
+def test_one_source_that_cannot_be_refined_is_named(run, folder, monkeypatch):
+    monkeypatch.setattr(FitRun, "start", lambda *_: pytest.fail(NO_RUN))
+    (folder / "cube.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    result = run("train", "photos", "cube.obj", *WORDS[3:], "--refine-poses")
+    assert result.exit_code == 2 and "cube.obj: the views of a mesh have exact poses" in result.stderr
 
 
 def test_memory_is_expected_of_all_together(run, folder, monkeypatch):
