@@ -16,14 +16,14 @@ SEED ?= 0
 
 SLOW ?=
 ORDER ?=
-SCENE ?=
 SHARE ?= 1
+MITSUBA ?=
 
-.PHONY: help demo test test-order test-slow fuzz docs lint bench bench-paper bench-real stability clean
+.PHONY: help demo test test-order test-slow fuzz docs lint bench bench-paper bench-real bench-splats bench-table1 stability clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
-	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
 
 demo: $(VENV)  ## two small scenes, fused and rendered
 	$(PYTHON) examples/demo.py
@@ -51,8 +51,9 @@ fuzz: $(VENV)  ## 10,000 hostile packs, captures and meshes, 1,000 by whole comm
 docs: $(VENV)  ## docs/commands.md, out of --help
 	$(PYTHON) -m docs.commands
 
-lint: $(VENV)  ## ruff
+lint: $(VENV)  ## ruff, rules and format
 	$(PYTHON) -m ruff check .
+	$(PYTHON) -m ruff format --check .
 
 bench: $(VENV)  ## the measurements that the claims rest on; DATA= a folder with bear/, chair/ and fuze/: full frames too
 	$(PYTHON) -m benchmarks
@@ -65,6 +66,12 @@ bench-real: $(VENV)  ## real captures: docs/real; DATA= a folder of captures, SH
 	$(PYTHON) -m benchmarks.real $(DATA) --share $(SHARE)
 	$(PYTHON) -m benchmarks.placed $(DATA) --share $(SHARE)
 	$(PYTHON) -m benchmarks.extraction $(DATA) --share $(SHARE)
+
+bench-splats: $(VENV)  ## splats as fields, alone and among other systems' fields on a park; DATA= a folder with splats/, bear/ and foreign/, MITSUBA= a Python that has Mitsuba
+	$(PYTHON) -m benchmarks.splats $(DATA) $(if $(MITSUBA),--mitsuba $(MITSUBA))
+
+bench-table1: $(VENV)  ## every kind on the same scenes: docs/table1.md; DATA= a folder with chair/, fox/, bear/ and fuze/, SHARE= for less time
+	$(PYTHON) -m benchmarks.table1 $(DATA) --share $(SHARE)
 
 stability: $(VENV)  ## the failure suite at length: docs/stability.md and its chart
 	mkdir -p build

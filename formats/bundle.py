@@ -329,6 +329,7 @@ def _scene_summary(scene: SceneGraph, headers: dict[str, FieldHeader]) -> dict:
         "generator": scene.generator,
         "composition": scene.composition,
         "framing": scene.framing and list(scene.framing),
+        "up": scene.up and list(scene.up),
         "cameras": scene.cameras and read_camera_set(scene.cameras).summary(),
         "nodes": nodes,
         "objects": objects_in(scene, headers),

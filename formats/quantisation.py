@@ -61,9 +61,7 @@ def code_bytes(numbers: int, bits: int) -> int:
     return -(-numbers * bits // 8)
 
 
-def quantised(
-    array: np.ndarray, bits: int, runs: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def quantised(array: np.ndarray, bits: int, runs: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Scales, float16 of `scales_shape`, and codes, flat uint8, of a float array of two or three dimensions.
 
     An error is at most scale / (2 L), or 2^-24 where that is more, in 8 bits; in 4 the largest numbers of a

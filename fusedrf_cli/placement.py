@@ -1,10 +1,16 @@
 """An object's placement: from the options of the command line to the keywords of a scene's node."""
 
 import math
+from collections.abc import Sequence
 
 from fusedrf_cli.errors import UsageProblem
 
 Vector = tuple[float, float, float]
+STANDS = 0.9
+"""The cosine of how far what stands upright leans at most."""
+AXES = {
+    (1, 0, 0): "+x", (-1, 0, 0): "-x", (0, 1, 0): "+y", (0, -1, 0): "-y", (0, 0, 1): "+z", (0, 0, -1): "-z",
+}  # fmt: skip
 
 
 def node_words(
@@ -40,3 +46,27 @@ def quaternion(degrees: Vector) -> tuple[float, float, float, float]:
         cx * cy * sz - sx * sy * cz,
         cx * cy * cz + sx * sy * sz,
     )
+
+
+def lying_note(path: str, up: Sequence[float] | None, placed: Sequence[Sequence[float]]) -> str | None:
+    """What is to be said of a source that is placed by a (4, 4) in a scene with +z up, and does not stand
+    upright in it; None where it does. up: which way is up in its own world; None: +z."""
+    if up is None:
+        return None
+    there = [sum(a * b for a, b in zip(row[:3], up, strict=True)) for row in placed[:3]]
+    if there[2] >= STANDS * math.hypot(*there):
+        return None
+    turn = ",".join(f"{angle:.6g}" for angle in turn_upright(up))
+    axis = AXES.get(tuple(up), ",".join(f"{part:.3g}" for part in up))
+    return f"{path}: {axis} is up in it, and +z in the scene; -r {turn} makes it stand upright"
+
+
+def turn_upright(up: Sequence[float]) -> Vector:
+    """Degrees about the x, then the y, then the z axis that turn a direction to +z.
+
+    >>> turn_upright((0, -1, 0))
+    (-90.0, 0.0, 0.0)
+    """
+    x, y, z = up
+    about_x, about_y = math.atan2(y, z), math.atan2(-x, math.hypot(y, z))
+    return math.degrees(about_x) + 0.0, math.degrees(about_y) + 0.0, 0.0  # + 0.0: no "-0"

@@ -18,11 +18,12 @@ def write_single(
     precision: str = "float16",
     history: Iterable[dict] = (),
     overwrite: bool = False,
+    up: tuple[float, ...] | None = None,
 ) -> None:
     """A bundle whose scene is one node `name` that holds one field."""
     writer = BundleWriter()
     node = make_node(name, field=writer.add_field(record, precision))
-    scene = SceneGraph((node,), history=tuple(history), generator="fusedrf")
+    scene = SceneGraph((node,), history=tuple(history), generator="fusedrf", up=up)
     writer.write(path, scene, overwrite=overwrite)
 
 

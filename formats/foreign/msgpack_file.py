@@ -75,7 +75,9 @@ def _unzipped(path: Path | str) -> bytearray:
                             f"{path}: unpacks to more than {limit:,} bytes, which is not believed"
                         )
         except (OSError, EOFError, zlib.error) as error:
-            raise BadCheckpoint(f"{path}: its gzip stream is damaged or cut short ({error})") from error
+            raise BadCheckpoint(
+                f"{path}: its gzip stream is damaged or cut short ({error}); copy it again"
+            ) from error
     return data
 
 

@@ -147,6 +147,10 @@ def _other_file(path: Path, head: bytes) -> FormatError:
     other = identify(head, path.suffix)
     if other is None or other.kind in ("checkpoint", "archive", "text", "other"):
         return UnknownCheckpoint(f"{path}: begins as no checkpoint of a known system does; {known_systems()}")
+    if other.kind == "splats":
+        return UnknownCheckpoint(
+            f"{path}: is {other.what}, but cut short or of no format that is read; copy or export it again"
+        )
     return UnknownCheckpoint(
         f"{path}: is {other.what}, no checkpoint; {CURES.get(other.kind, known_systems())}"
     )
@@ -276,6 +280,7 @@ def _of_folder(folder: Path) -> Checkpoint:
             continue
     if not found:
         names = f"{files[0].name} is none" if files else f"no file named {', '.join(ENDINGS)}"
+        names += "; of splats give the file itself"
         raise UnknownCheckpoint(
             f"{folder}: holds no checkpoint of a known system ({names}); {known_systems()}"
         )

@@ -170,7 +170,7 @@ class _Reader:
         scales = part.scales.astype(np.float64)
         splats = gathered(
             self.path,
-            "splats of glTF",
+            "a glTF file of splats",
             centres=part.centres,
             scales=np.exp(scales) if logarithms and not part.packed else scales,
             rotations=part.rotations,
@@ -194,7 +194,7 @@ class _Reader:
         more = [[(0, 0), (0, count - piece.harmonics.shape[1]), (0, 0)] for piece in pieces]
         splats = gathered(
             self.path,
-            "splats of glTF",
+            "a glTF file of splats",
             centres=np.concatenate([piece.centres for piece in pieces]),
             scales=np.concatenate([piece.scales for piece in pieces]),
             rotations=np.concatenate([piece.rotations for piece in pieces]),

@@ -164,9 +164,12 @@ def best_of(
         maker, choosing, seconds = begin(builder, scene, request, device, progress, together, background)
         kept = search(maker, choosing, builder, request, saved, seconds)
     except TooSmall as error:
+        instead = (
+            ", or a --kind that learns one field" if request.kind == registry.AUTO and not kind.field else ""
+        )
         raise UsageProblem(
             f"--max-size is too small: the file takes {readable_size(error.smallest)} at its coarsest, "
-            f"where {readable_size(builder_request.limit)} were allowed; give more"
+            f"where {readable_size(builder_request.limit)} were allowed; give more{instead}"
         ) from error
     return Candidate(kept, builder, lambda: figures_of(kept, maker, choosing, seconds), background)
 

@@ -130,6 +130,4 @@ def _warn_of_unposed(source: str, unposed: Sequence[str], plain: Sequence[str], 
     more = f" and {len(unposed) - most} more" if len(unposed) > most else ""
     names = ", ".join(unposed[:most]) + more
     why = f"; {', '.join(plain[:most])} are blurred or plain" if plain else ""
-    progress.warn(
-        f"{source}: {len(unposed)} of {count} photos found no pose and were left out: {names}{why}"
-    )
+    progress.warn(f"{source}: {len(unposed)} of {count} photos found no pose and were left out: {names}{why}")

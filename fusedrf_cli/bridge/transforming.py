@@ -3,12 +3,14 @@ distilled into a field with others becomes a node first, with the numbers of its
 
 import numpy as np
 
+from formats.bundle import read_summary
 from formats.graph import changed, chosen, moved, renamed, shown, with_nodes
 from formats.scene import Node
 from fusedrf_cli.bridge.deleting import EMPTIED, Deletion, released
 from fusedrf_cli.bridge.editing import SAME_BITS, Edit, brought
 from fusedrf_cli.bridge.runtime import engine
 from fusedrf_cli.errors import InvalidInput
+from fusedrf_cli.placement import lying_note
 from fusedrf_cli.requests import AddRequest, ArrangeRequest, ShowRequest
 
 
@@ -19,6 +21,10 @@ def add(request: AddRequest, progress) -> dict:
         draft = edit.draft
         draft.check_free(request.name)
         node = brought(draft, request, request.name, request.object_to_world)
+        if draft.graph.up is None:
+            note = lying_note(request.source, read_summary(request.source)["up"], node.node_to_parent)
+            if note is not None:
+                progress.warn(note)
         draft.graph = with_nodes(draft.graph, [node])
         return edit.done("added", [request.name], [node])
 

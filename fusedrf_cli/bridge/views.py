@@ -61,7 +61,11 @@ def aimed(request: RenderRequest) -> bool:
 
 
 def unit_vector(direction: Sequence[float]) -> np.ndarray:
-    """(3,) of length 1, along a direction of any other."""
+    """(3,) of length 1, along a direction of any other. UsageProblem for one of length 0."""
+    if not any(direction):
+        raise UsageProblem(
+            "0,0,0 is no direction, as which --up is given; give that of an axis, such as 0,0,1"
+        )
     scaled = np.array(direction) / np.abs(direction).max()  # whose square neither overflows nor vanishes
     return scaled / np.linalg.norm(scaled)
 

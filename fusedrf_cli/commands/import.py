@@ -3,7 +3,7 @@
 import click
 
 from fusedrf_cli import options, verbs
-from fusedrf_cli.option_types import BoxType, InputType, PositiveType, VectorType
+from fusedrf_cli.option_types import BoxType, InputType, PositiveType, UpType
 
 
 @click.command("import")
@@ -13,12 +13,19 @@ from fusedrf_cli.option_types import BoxType, InputType, PositiveType, VectorTyp
 @click.option(
     "--aabb", type=BoxType(), help="Where a field lies whose file has no box, xmin,ymin,zmin,xmax,ymax,zmax."
 )
-@click.option("--near", type=PositiveType(), metavar="LENGTH", help="Or nearest to the cameras that it does,")
-@click.option("--far", type=PositiveType(), metavar="LENGTH", help="and farthest from them.")
+@click.option(
+    "--near",
+    type=PositiveType(),
+    metavar="LENGTH",
+    help="With --cameras, instead: how near to these it begins,",
+)
+@click.option("--far", type=PositiveType(), metavar="LENGTH", help="and how far from them it ends.")
 @click.option(
     "--cameras", type=InputType(), metavar="CAPTURE", help="The capture it was learnt from: keep its cameras."
 )
-@click.option("--up", type=VectorType(), help="Which way of its world is up; default: as its format has it.")
+@click.option(
+    "--up", type=UpType(), help="Which way of its world is up; auto, the default: as its format has it."
+)
 @click.option(
     "--time", type=float, help="Take a moving scene at this time: K-Planes' from -1 to 1, D²NeRF's from 0 on."
 )

@@ -205,3 +205,16 @@ def test_one_more_of_the_same_object_costs_a_placement(report, picture, folder):
     words = ("floor.rfpack", "-t", "0,0,-0.7", "red.rfpack", "-t", "-0.5,0,0", "red.rfpack", "-t", "0.7,0,0")
     report("compose", *words, "-o", "three.json")
     assert psnr(picture("two.rfpack"), picture("three.json")) > 40
+
+
+def test_an_object_that_would_lie_on_its_side_is_told(report, folder):
+    """By the rotation that makes it stand, which is then taken without a word."""
+    blue, writer = OpenBundle(folder / "blue.rfpack"), BundleWriter()
+    for member in blue.headers:
+        writer.copy_field(blue, member)
+    writer.write(folder / "lying.rfpack", replace(blue.scene, up=(0.6, 0.0, -0.8)))
+    said = report("add", "blocks.rfpack", "lying.rfpack", *AT, "-o", "more.rfpack")
+    (note,) = said["warnings"]
+    assert note.startswith("lying.rfpack: 0.6,0,-0.8 is up") and "-r 180,-36.8699,0 makes" in note
+    turned = ("-r", "180,-36.8699,0", *AT)
+    assert not report("add", "blocks.rfpack", "lying.rfpack", *turned, "-o", "more.rfpack", "-w")["warnings"]

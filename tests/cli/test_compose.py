@@ -4,7 +4,9 @@ import os
 import numpy as np
 import pytest
 
+from formats.bundle import read_bundle
 from formats.scene import parse_scene, read_scene
+from tests.bundles import write_single
 
 
 def test_each_input_keeps_the_words_after_it(run):
@@ -130,3 +132,17 @@ def test_an_existing_scene_is_kept_unless_overwritten(run, folder):
     assert result.exit_code == 1 and "--overwrite" in result.stderr
     assert (folder / "scene.json").read_text() == "mine"
     assert run("compose", "chair.rfpack", "-o", "scene.json", "-w").exit_code == 0
+
+
+def test_a_source_that_would_lie_on_its_side_is_told_once(run, folder):
+    """-y is up in a splat file's world; who turns it upright, or asks for +z, is told nothing."""
+    record = next(iter(read_bundle("chair.rfpack").fields.values()))
+    write_single("plant.rfpack", record, "plant", up=(0.0, -1.0, 0.0))
+    inputs = ["chair.rfpack", "plant.rfpack", "-t", "1,0,0", "-r", "0,0,20", "plant.rfpack"]
+    result = run("compose", *inputs, "-o", "scene.json")
+    told = "plant.rfpack: -y is up in it, and +z in the scene; -r -90,0,0 makes it stand upright"
+    assert result.exit_code == 0 and result.stderr.count("\n") == 1 and told in result.stderr
+    upright = run("compose", "plant.rfpack", "-r", "-90,0,30", "-o", "-")
+    assert upright.stderr == "" and json.loads(upright.stdout)["nodes"]
+    said = json.loads(run("info", "plant.rfpack", "--json").stdout)
+    assert said["up"] == [0.0, -1.0, 0.0]

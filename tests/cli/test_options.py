@@ -5,7 +5,7 @@ import warnings
 import click
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from formats.errors import FormatWarning
@@ -23,7 +23,7 @@ from fusedrf_cli.option_types import (
     SizeType,
     VectorType,
 )
-from fusedrf_cli.placement import node_words, quaternion
+from fusedrf_cli.placement import node_words, quaternion, turn_upright
 
 IDENTITY = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
 SPELLED = "1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1"
@@ -107,6 +107,15 @@ def test_a_rotation_turns_about_x_then_y_then_z(degrees):
     expected = about(2, degrees[2]) @ about(1, degrees[1]) @ about(0, degrees[0])
     placed = make_node("a", rotation=quaternion(degrees)).node_to_parent[:3, :3]
     np.testing.assert_allclose(placed, expected, atol=1e-12)
+
+
+@given(st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda up: np.linalg.norm(up) > 1e-3))
+@example((0.0, -1.0, 0.0))
+@example((1.0, 0.0, 0.0))
+@example((0.0, 0.0, -1.0))
+def test_what_is_up_anywhere_is_turned_to_z(up):
+    turn = make_node("a", rotation=quaternion(turn_upright(up))).node_to_parent[:3, :3]
+    np.testing.assert_allclose(turn @ up, [0, 0, np.linalg.norm(up)], atol=1e-12)
 
 
 def test_an_object_is_scaled_then_turned_then_moved():

@@ -172,6 +172,8 @@ def answer(field: tuple, x: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.n
         return of_tensors(kind, told, arrays, x, d)
     if kind == "sparse":
         return of_bricks(told, arrays, x, d)
+    if kind in ("hash", "mlp"):
+        return of_networks(kind, told, arrays, x, d)
     return of_grid(kind, told, arrays, x, d)
 
 
@@ -208,6 +210,58 @@ def of_grid(kind: str, told: dict, arrays: dict, x: np.ndarray, d: np.ndarray):
             inner = np.maximum(inner @ arrays["decoder.hidden.weight"] + arrays["decoder.hidden.bias"], 0)
             rgb = (inner @ arrays["decoder.out.weight"] + arrays["decoder.out.bias"])[:, :3]
     return np.where(here, rho * density(f, told), 0), logistic(rgb)
+
+
+def of_networks(kind: str, told: dict, arrays: dict, x: np.ndarray, d: np.ndarray):
+    """2.6: `hash` and `mlp`."""
+    box, cells, shape = np.array(told["aabb"]), told["cells"], told["shape"]
+    y, rho = contract(x, d, cells.get("space", "bounded"))
+    here = occupied(cells_of(arrays, "occupancy", cells["counts"]), np.array(cells["aabb"]), y)
+    if kind == "hash":
+        u = (y - box[:3]) / (box[3:] - box[:3]).max()
+        features = hashed_levels(shape, told["resolution"], arrays["density_rows"], u)
+        weights = arrays["sigma_weights"]
+        f = features @ weights[:-1] + weights[-1]
+    else:
+        at = 2 * (y - box[:3]) / (box[3:] - box[:3]) - 1
+        waves = [wave(2**level * at) for level in range(shape["count"]) for wave in (np.sin, np.cos)]
+        read = np.concatenate([at, *waves], 1)
+        read = np.pad(read, ((0, 0), (0, -read.shape[1] % 8)))
+        features = read
+        for i in range(shape["layers"] + 1):
+            layer = arrays[f"sigma_layer_{i}"]
+            features = features @ layer[:-1] + layer[-1]
+            if i and i == shape["skip"]:
+                features = features + read @ arrays["sigma_again"]
+            features = np.maximum(features, 0) if i < shape["layers"] else features
+        f = features[:, 0]
+    inner = np.concatenate([features, harmonics(16, d)], 1)
+    inner = np.maximum(inner @ arrays["rgb_hidden.weight"] + arrays["rgb_hidden.bias"], 0)
+    rgb = (inner @ arrays["rgb_out.weight"] + arrays["rgb_out.bias"])[:, :3]
+    return np.where(here, rho * density(f, told), 0), logistic(rgb)
+
+
+def hashed_levels(shape: dict, resolution: list[int], rows: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """2.6: the features of a `hash_grid` of a `hash` field."""
+    count, found, first = shape["levels"], [], 0
+    for level in range(count):
+        s = 16 * (shape["finest"] / 16) ** (level / max(count - 1, 1)) - 1
+        side = int(np.ceil(s)) + 1
+        number = min(-(-(side**3) // 8) * 8, 2 ** shape["log2_rows"])
+        features = np.zeros((len(u), shape["features"]))
+        if level == 0 or s <= 2 * max(resolution):
+            low = np.floor(s * u + 0.5).astype(int)
+            for corner in np.ndindex(2, 2, 2):
+                i, j, k = (low + corner).T
+                row = (k * side + j) * side + i
+                if side**3 > number:
+                    row = i ^ (j * 2654435761) ^ (k * 805459861)
+                share = np.where(corner, s * u + 0.5 - low, 1 - (s * u + 0.5 - low)).prod(1)
+                features += share[:, None] * rows[first + row % number]
+        found.append(features)
+        first += number
+    features = np.concatenate(found, 1)
+    return np.pad(features, ((0, 0), (0, -features.shape[1] % 8)))
 
 
 def used_vertices(cells: np.ndarray, cells_box: np.ndarray, box: np.ndarray, resolution) -> np.ndarray:

@@ -136,8 +136,8 @@ def test_its_sweeps_are_keywords_of_fuse(kind):
 
 def test_a_kind_that_nobody_has_is_a_clear_sentence(run, folder):
     for words in (("fuse", "pair.json", "-o", "no.rfpack"), PHOTOS):
-        result = run(*words, "--kind", "hash")
-        assert result.exit_code == 2 and "'hash' is not one of" in result.stderr
+        result = run(*words, "--kind", "voxels")
+        assert result.exit_code == 2 and "'voxels' is not one of" in result.stderr
 
 
 def test_auto_says_why(report):

@@ -63,7 +63,9 @@ def import_field(request: ImportRequest, progress) -> dict:
     memory = Memory(request.memory)
     capture = None if request.cameras is None else read_capture(request.cameras)
     if Path(request.path).is_file() and is_splats(request.path):
+        check_boxless(request)
         system, (imported, up) = "Gaussian splats", splats.read(request.path, memory)
+        imported = replace(imported, notes=[*imported.notes, *unmoved(request)])
     else:
         (system, imported), up = of_system(request, capture, memory), None
     progress.phase("writing", None)
@@ -115,14 +117,27 @@ def imported_from(checkpoint: Checkpoint, request: ImportRequest, capture: Captu
     module, function = READERS[checkpoint.system]
     read: Callable[..., Imported] = getattr(import_module(f"{__name__}.{module}"), function)
     boxless = checkpoint.system in BOXLESS
-    if not boxless and (request.aabb or request.near or request.far):
-        raise UsageProblem("--aabb, --near and --far are for files without a box, and this one has its own")
+    if not boxless:
+        check_boxless(request)
     given = {"box": box_of(request, capture, checkpoint)} if boxless else {}
     given |= {"time": request.time} if checkpoint.system in MOVING else {}
     try:
-        return read(checkpoint, **given)
+        imported = read(checkpoint, **given)
     except (FormatError, ValueError) as error:
         raise InvalidInput(f"{checkpoint.path}: {error}") from error
+    notes = [] if "time" in given else unmoved(request)
+    return replace(imported, notes=[*imported.notes, *notes])
+
+
+def check_boxless(request: ImportRequest) -> None:
+    """UsageProblem where a box is given of a file that has its own."""
+    if request.aabb or request.near or request.far:
+        raise UsageProblem("--aabb, --near and --far are for files without a box, and this one has its own")
+
+
+def unmoved(request: ImportRequest) -> list[str]:
+    """What is to be said of a time for what does not move."""
+    return [] if request.time is None else ["nothing in it moves, and --time is not used"]
 
 
 def box_of(request: ImportRequest, capture: Capture | None, checkpoint: Checkpoint) -> np.ndarray:

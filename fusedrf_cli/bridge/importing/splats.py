@@ -36,7 +36,7 @@ def read(path: str, memory: Memory) -> tuple[Imported, tuple[float, ...] | None]
         ImportedNode(field_of(splats, shell), suffix=f"-{i + 1}" if len(shells) > 1 else "")
         for i, shell in enumerate(shells)
     ]
-    notes = [f"a file of {splats.kind}", *splats.notes]
+    notes = [f"it is {splats.kind}", *splats.notes]
     if len(shells) > 1:
         counts = ", ".join(f"{len(shell):,}" for shell in shells)
         notes.append(

@@ -67,6 +67,11 @@ def bound(field, sections: dict, features: torch.Tensor, **options) -> tuple[flo
 def outputs_at(field, cell, scratch):
     """Where in scratch the features of a point are, computed anew."""
     features_forward(field, cell, scratch, scratch, AT)
+    return kept_at()
+
+
+def kept_at():
+    """Where `outputs_at` has left them."""
     return np.uint64(AT)
 
 

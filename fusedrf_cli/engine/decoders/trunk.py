@@ -108,12 +108,17 @@ def bound(
 
 def outputs_at(field, cell, scratch):
     """Where in scratch all outputs at a point are, computed anew."""
-    x, out = np.uint64(AT + X), np.uint64(AT + OUT)
+    x, out = np.uint64(AT + X), kept_at()
     features_forward(field, cell, scratch, scratch, AT + X)
     network(
         WIDTH, HIDDEN, LAYERS, SKIP, OUTPUTS, field.params, field.layers, scratch, x, np.uint64(AT + H), out
     )
     return out
+
+
+def kept_at():
+    """Where `outputs_at` has left them."""
+    return np.uint64(AT + OUT)
 
 
 def pending_at(scratch):

@@ -110,7 +110,7 @@ class FitRun:
         dataset = RayDataset(cameras, images, generator)
         coarse = max(current(BuilderConfig).least_texels, round(config.longest * config.stages[0][1]))
         kind = registry.kind(config.kind)
-        field = kind.create(kind.untrained(aabb, coarse, config.storage), generator, name).to(config.device)
+        field = kind.begun(aabb, config.longest, coarse, config.storage, generator, name).to(config.device)
         if limits is not None:
             field = field.with_occupancy(limits)
         ignored = None if dataset.ignored is None else dataset.ignored.numpy()
@@ -311,7 +311,8 @@ class FitRun:
         self.found_density = True
         self.occupy(occupancy)
         tight = occupancy.tight_aabb()
-        if not self.config.unbounded and volume(tight) < self.config.shrink_below * volume(occupancy.aabb):
+        bounded = self.field.over_texels and not self.config.unbounded
+        if bounded and volume(tight) < self.config.shrink_below * volume(occupancy.aabb):
             before = self.field
             self.resize(tight, max(self.field.resolution))
             occupancy = occupancy_of(self.field, tight)

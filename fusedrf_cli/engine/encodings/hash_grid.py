@@ -3,7 +3,8 @@ that has more of them than rows share these by a hash (Instant-NGP, Müller et a
 
 A point u of the unit cube lies at s u + o between the vertices of a level, which `side` numbers on an axis; x
 goes first. `levels_of` gives those of tiny-cuda-nn. Other systems take other scales, sides and offsets, or
-hash where a grid has no more vertices than rows.
+hash where a grid has no more vertices than rows. A grid that `grows` leaves out levels finer than half a
+texel: as a field learns, from coarse texels to fine ones, they come in one after the other.
 """
 
 from typing import Annotated, NamedTuple
@@ -16,8 +17,10 @@ from msgspec import Meta
 from fusedrf_cli.engine.encodings.hash_runs import PRIMES
 from fusedrf_cli.engine.fields.box import ParameterBlock, largest
 from fusedrf_cli.engine.kernels.prefetch import prefetch
-from fusedrf_cli.engine.kernels.primitives import accumulate
+from fusedrf_cli.engine.kernels.primitives import accumulate, scatter_4
 from fusedrf_cli.engine.kernels.reference import OCTANTS, whole
+
+FINER = 2  # vertices on a texel of the finest level of a grid that grows
 
 
 class Level(msgspec.Struct, forbid_unknown_fields=True):
@@ -40,6 +43,7 @@ class Options(msgspec.Struct, forbid_unknown_fields=True):
 
     features: Annotated[int, Meta(ge=1, le=16)]
     levels: Annotated[list[Level], Meta(min_length=1, max_length=32)]
+    grows: bool = False
 
 
 class Arrays(NamedTuple):
@@ -51,6 +55,7 @@ class Arrays(NamedTuple):
     sides: object  # (LEVELS,) int64
     rows: object  # (LEVELS,) int64, of a level
     hashed: object  # (LEVELS,) bool
+    used: object  # int64, how many of the levels are not left out
 
 
 def levels_of(levels: int, log2_rows: int, base: int, growth: float) -> list[dict]:
@@ -64,33 +69,43 @@ def levels_of(levels: int, log2_rows: int, base: int, growth: float) -> list[dic
     return made
 
 
-def sizes(features: int, levels: list[dict]) -> dict[str, int]:
+def used_of(resolution: tuple[int, int, int], levels: list[dict], grows: bool) -> int:
+    """How many levels, of which the coarser come first, are not left out."""
+    finest = FINER * max(resolution)
+    return max(1, sum(level["scale"] <= finest for level in levels)) if grows else len(levels)
+
+
+def sizes(features: int, levels: list[dict], grows: bool = False) -> dict[str, int]:
     """See encodings."""
     return {"LEVELS": len(levels), "FEATURES": features, "WIDTH": -(-len(levels) * features // 8) * 8}
 
 
-def sections(resolution: tuple[int, int, int], features: int, levels: list[dict]) -> list[ParameterBlock]:
+def sections(
+    resolution: tuple[int, int, int], features: int, levels: list[dict], grows: bool = False
+) -> list[ParameterBlock]:
     """See encodings. Drawn as in the paper (sec. 4), but normal."""
     rows = sum(level["rows"] for level in levels)
-    return [ParameterBlock("rows", (rows, features), spread=1e-4)]
+    return [ParameterBlock("rows", (rows, features), spread=1e-4, fades=True)]
 
 
-def arrays(field, starts: np.ndarray, features: int, levels: list[dict]) -> Arrays:
+def arrays(field, starts: np.ndarray, features: int, levels: list[dict], grows: bool = False) -> Arrays:
     """See encodings."""
     columns = {name: np.array([level[name] for level in levels]) for name in levels[0]}
     first = np.cumsum(columns["rows"]) - columns["rows"]
     return Arrays(
         starts[0] + features * first, columns["scale"].astype(np.float64),
         columns["offset"].astype(np.float64), columns["side"], columns["rows"], columns["hashed"],
+        np.int64(used_of(field.resolution, levels, grows)),
     )  # fmt: skip
 
 
 def reference(
-    field, sections: dict, unit: torch.Tensor, read: None, features: int, levels: list[dict]
-) -> torch.Tensor:
+    field, sections: dict, unit: torch.Tensor, read: None, features: int, levels: list[dict],
+    grows: bool = False,
+) -> torch.Tensor:  # fmt: skip
     """See encodings."""
     per_level, first, table = [], 0, sections["rows"]
-    for level in levels:
+    for level in levels[: used_of(field.resolution, levels, grows)]:
         at = unit * float(level["scale"]) + level["offset"]
         below = at.detach().floor()
         total = table.new_zeros(len(unit), features)
@@ -103,11 +118,11 @@ def reference(
             total = total + weight[:, None].to(table.dtype) * table[first + number % level["rows"]]
         per_level.append(total)
         first += level["rows"]
-    filled = table.new_zeros(len(unit), sizes(features, levels)["WIDTH"] - len(levels) * features)
+    filled = table.new_zeros(len(unit), sizes(features, levels)["WIDTH"] - len(per_level) * features)
     return torch.cat([*per_level, filled], 1)
 
 
-def bound(sections: dict, read: None, features: int, levels: list[dict]) -> torch.Tensor:
+def bound(sections: dict, read: None, features: int, levels: list[dict], grows: bool = False) -> torch.Tensor:
     """See encodings."""
     width = sizes(features, levels)["WIDTH"]
     return largest(sections["rows"], kept=1).repeat(-(-width // features))[:width]
@@ -124,49 +139,103 @@ def cell_at(field, level, unit):
     return (i, j, k), (x - i, y - j, z - k)
 
 
-def corner(field, level, below, share, q):
-    """Where the row of corner q = 4 a + 2 b + c of a cell begins, and its weight."""
-    a, b, c = q >> 2, (q >> 1) & 1, q & 1
-    weight = (share[0] if a else 1.0 - share[0]) * (share[1] if b else 1.0 - share[1])
-    weight *= share[2] if c else 1.0 - share[2]
-    i, j, k = below[0] + a, below[1] + b, below[2] + c
-    side, rows = field.sides[level], field.rows[level]
+def corner_rows(field, level, below):
+    """Where the rows of a cell's corners begin, corner q = 4 a + 2 b + c."""
+    i, j, k = below
+    start, rows = field.starts[level], field.rows[level]
     if field.hashed[level]:
-        row = (i ^ (j * PRIMES[0]) ^ (k * PRIMES[1])) & (rows - 1)
+        last, near, far = rows - 1, j * PRIMES[0], (j + 1) * PRIMES[0]
+        low, high = k * PRIMES[1], (k + 1) * PRIMES[1]
+        found = (
+            (i ^ near ^ low) & last, (i ^ near ^ high) & last, (i ^ far ^ low) & last,
+            (i ^ far ^ high) & last, ((i + 1) ^ near ^ low) & last, ((i + 1) ^ near ^ high) & last,
+            ((i + 1) ^ far ^ low) & last, ((i + 1) ^ far ^ high) & last,
+        )  # fmt: skip
     else:
-        row = ((k * side + j) * side + i) % rows
-    return np.uint64(field.starts[level] + row * FEATURES), field.params.dtype.type(weight)
+        side = field.sides[level]
+        n, up = (k * side + j) * side + i, side * side
+        found = (
+            numbered(n, rows), numbered(n + up, rows), numbered(n + side, rows),
+            numbered(n + side + up, rows), numbered(n + 1, rows), numbered(n + 1 + up, rows),
+            numbered(n + 1 + side, rows), numbered(n + 1 + side + up, rows),
+        )  # fmt: skip
+    return (
+        np.uint64(start + found[0] * FEATURES), np.uint64(start + found[1] * FEATURES),
+        np.uint64(start + found[2] * FEATURES), np.uint64(start + found[3] * FEATURES),
+        np.uint64(start + found[4] * FEATURES), np.uint64(start + found[5] * FEATURES),
+        np.uint64(start + found[6] * FEATURES), np.uint64(start + found[7] * FEATURES),
+    )  # fmt: skip
+
+
+def numbered(n, rows):
+    """n % rows, which takes long, and n is seldom beyond."""
+    return n if n < rows else n % rows
+
+
+def corner_weights(field, share):
+    """The weights of a cell's corners at a point, as `corner_rows` has them."""
+    real = field.params.dtype.type
+    a, b, c = real(share[0]), real(share[1]), real(share[2])
+    one = real(1)
+    low, lowered, raised, high = (one - a) * (one - b), (one - a) * b, a * (one - b), a * b
+    return (
+        low * (one - c), low * c, lowered * (one - c), lowered * c, raised * (one - c), raised * c,
+        high * (one - c), high * c,
+    )  # fmt: skip
 
 
 def forward(field, unit, scratch, out, base):
     """See encodings."""
-    for level in range(LEVELS):
+    p = field.params
+    for level in range(field.used):
         start = np.uint64(base + level * FEATURES)
-        for f in range(np.uint64(FEATURES)):
-            out[start + f] = 0
         below, share = cell_at(field, level, unit)
-        for q in range(8):
-            row, weight = corner(field, level, below, share, q)
+        rows, weights = corner_rows(field, level, below), corner_weights(field, share)
+        if FEATURES == 4:
+            mixed_4(out, start, weights, p, rows)
+        else:
             for f in range(np.uint64(FEATURES)):
-                out[start + f] += weight * field.params[row + f]
-    for r in range(LEVELS * FEATURES, WIDTH):
+                out[start + f] = 0
+            for q in range(8):
+                for f in range(np.uint64(FEATURES)):
+                    out[start + f] += weights[q] * p[rows[q] + f]
+    for r in range(field.used * FEATURES, WIDTH):
         out[base + r] = 0
+
+
+def mixed_4(out, o, weights, values, rows):
+    """out[o : o + 4] = Σ_q weights[q] values[rows[q] : rows[q] + 4], all loads before all stores (kernels/
+    primitives.py, `add_scaled_8`)."""
+    zero = out.dtype.type(0)
+    first, second, third, fourth = zero, zero, zero, zero
+    for q in range(8):
+        weight, row = weights[q], rows[q]
+        first += weight * values[row]
+        second += weight * values[row + np.uint64(1)]
+        third += weight * values[row + np.uint64(2)]
+        fourth += weight * values[row + np.uint64(3)]
+    out[o], out[o + np.uint64(1)] = first, second
+    out[o + np.uint64(2)], out[o + np.uint64(3)] = third, fourth
 
 
 def backward(field, unit, d, base, scratch, grad):
     """See encodings."""
-    for level in range(LEVELS):
+    for level in range(field.used):
         start = np.uint64(base + level * FEATURES)
         below, share = cell_at(field, level, unit)
+        rows, weights = corner_rows(field, level, below), corner_weights(field, share)
         for q in range(8):
-            row, weight = corner(field, level, below, share, q)
-            for f in range(np.uint64(FEATURES)):
-                accumulate(grad, row + f, weight * d[start + f])
+            if FEATURES == 4:
+                scatter_4(grad, rows[q], weights[q], d, start)
+            else:
+                for f in range(np.uint64(FEATURES)):
+                    accumulate(grad, rows[q] + f, weights[q] * d[start + f])
 
 
 def prefetch_at(field, array, unit):
     """See encodings: the rows of all corners of all levels."""
-    for level in range(LEVELS):
+    for level in range(field.used):
         below, share = cell_at(field, level, unit)
+        rows = corner_rows(field, level, below)
         for q in range(8):
-            prefetch(array, corner(field, level, below, share, q)[0])
+            prefetch(array, rows[q])

@@ -202,9 +202,9 @@ class AssembledField(Assembled, BoxField):
         }
 
     def located(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """See Assembled: in the unit cube of the box, where a cell is occupied."""
-        box = exact(self.box, points.device)
-        unit = (points - box[:3]) / (box[3:] - box[:3])
+        """See Assembled: in the unit cube, where a cell is occupied."""
+        low, sides = (exact(part, points.device) for part in self.cube)
+        unit = (points - low) / sides
         inside = ((unit - 0.5).abs() <= 0.5 + 1e-9).all(1)  # as kernels/assembled.py's `steps_at`
         return unit.to(self.params.dtype), cell_at(self.occupancy, points)[1] & inside
 

@@ -28,6 +28,7 @@ class OccupancyConfig:
 
 
 MAX_STRIDE = 255
+MOST_POINTS = 1 << 25  # of a placed grid, by which cells are found: of one that is huge there are far more
 # where in a cell its density is probed
 PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)
 
@@ -87,24 +88,36 @@ class OccupancyGrid:
     @cached_property
     def passage(self) -> float:
         """The longest way of a ray through occupied cells, at most, in lengths that samples may lie apart, as
-        many times a step, or `unit` where there are strides: a ray passes the layers of cells along the axis
-        that it follows most, each in at most √3 times its thickness."""
+        many times a step, or `unit` where there are strides: each of its pieces, in a region of its own where
+        the space tells them, passes the layers of cells along the axis that it follows most, each in at most
+        √3 times its thickness."""
         if not self.occupied.any():
             return 0.0
-        lengths = []
+        pieces = [
+            self.longest_in(box) for box in getattr(self.space, "REGIONS", [self.aabb] * self.space.PIECES)
+        ]
+        return float(np.sqrt(3) * sum(sorted(pieces)[-self.space.PIECES :]))
+
+    def longest_in(self, box: np.ndarray) -> float:
+        """Of the axes, the longest sum of thicknesses of layers of cells in a box (6,) by how far samples in
+        them may lie apart."""
+        first = np.floor((box[:3] - self.aabb[:3]) / self.cell + 1e-9).astype(int)
+        end = np.ceil((box[3:] - self.aabb[:3]) / self.cell - 1e-9).astype(int)
+        cells = tuple(slice(max(a, 0), max(b, 0)) for a, b in zip(first, end, strict=True))
+        occupied, lengths = self.occupied[cells], []
         for axis in range(3):
             others = tuple({0, 1, 2} - {axis})
-            often = self.occupied.any(others)
+            often = occupied.any(others)
             if self.stride is not None:
-                closest = self.stride.min(others, where=self.occupied, initial=MAX_STRIDE)
+                closest = self.stride[cells].min(others, where=occupied, initial=MAX_STRIDE)
                 often = often / np.maximum(closest, 1)
             lengths.append(often.sum() * self.cell[axis])
-        return float(np.sqrt(3) * max(lengths))
+        return max(lengths)
 
     def most_samples(self, step: float) -> int:
         """How many samples a ray can have in occupied cells, at most; step: where there are no strides."""
         apart = step if self.stride is None else self.unit
-        passed = self.space.PIECES * self.passage / apart + self.space.PIECES
+        passed = self.passage / apart + self.space.PIECES
         return int(min(passed, self.space.most_samples(self.aabb, apart)))
 
     def tight_aabb(self, margin_cells: float = 1.0) -> np.ndarray:
@@ -291,6 +304,8 @@ def marked_cells(
         ).astype(int)
         + 1
     )
+    if space is not bounded and grid.occupied.sum() * np.prod(points, dtype=float) > MOST_POINTS:
+        return reached_cells(grid, object_to_field, aabb, counts, space)
     steps = np.stack(np.meshgrid(*[np.linspace(0, 1, n) for n in points], indexing="ij"), -1).reshape(-1, 3)
     corners = grid.aabb[:3] + np.argwhere(grid.occupied) * grid.cell
     marked = np.zeros(counts, bool)
@@ -309,6 +324,32 @@ def marked_cells(
             index = np.clip(np.floor((at - aabb[:3]) / cell).astype(np.int64), 0, counts - 1)
             marked[tuple(index.T)] = True
     return OccupancyGrid(aabb, marked).dilated().occupied
+
+
+def reached_cells(
+    grid: OccupancyGrid, object_to_field: np.ndarray, aabb: np.ndarray, counts: np.ndarray, space: ModuleType
+) -> np.ndarray:
+    """The same, of cells (X, Y, Z) of a space in which a straight line stays one within a cell: those whose
+    corners, placed in the grid, have a box around them that an occupied cell shares a volume with."""
+    back = np.linalg.inv(object_to_field)
+    sums = np.pad(grid.occupied.astype(np.int64).cumsum(0).cumsum(1).cumsum(2), ((1, 0),) * 3)
+    last = np.array(grid.occupied.shape)
+    axes = [np.linspace(low, high, n + 1) for low, high, n in zip(aabb[:3], aabb[3:], counts, strict=True)]
+    reached = np.zeros(counts, bool)
+    for i in range(counts[0]):
+        corners = np.stack(np.meshgrid(axes[0][i : i + 2], *axes[1:], indexing="ij"), -1)
+        points = space.inv_contract(torch.from_numpy(corners.reshape(-1, 3))).numpy()
+        at = (points @ back[:3, :3].T + back[:3, 3] - grid.aabb[:3]) / grid.cell
+        at = at.reshape(corners.shape)
+        eight = np.stack([at[a, b : counts[1] + b, c : counts[2] + c] for a, b, c in np.ndindex(2, 2, 2)])
+        low = np.clip(np.floor(eight.min(0)), 0, last).astype(np.int64)
+        high = np.clip(np.ceil(eight.max(0)), 0, last).astype(np.int64)
+        held = np.zeros(low.shape[:2], np.int64)
+        for ends in np.ndindex(2, 2, 2):
+            index = tuple(np.where(end, high[..., k], low[..., k]) for k, end in enumerate(ends))
+            held += (-1) ** (3 - sum(ends)) * sums[index]
+        reached[i] = (held > 0) & (low < high).all(-1)
+    return reached
 
 
 def squeezed(matrix: np.ndarray) -> float:

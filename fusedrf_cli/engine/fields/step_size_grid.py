@@ -46,9 +46,13 @@ class StepSizeGrid:
         there = grid.space.contract(torch.from_numpy(frame @ back[:3, :3].T + back[:3, 3]))
         if alike:
             return finest * grid.strides_at(there.numpy())
-        ratio = (space.rates(here) / grid.space.rates(there)).sqrt().numpy()
-        # to the far side of a cell
-        ratio *= np.maximum(1 - self.whole.cell[0] / 2 / space.rates(here).sqrt().numpy(), 0.1)
+        inverse = space.rates(here).sqrt()  # 1 / n
+        far = (inverse - self.whole.cell[0] / 2).clamp_min(0.1 * inverse)  # that on the far side of a cell
+        frame_far = frame * (inverse / far).numpy()[:, None]
+        there_far = grid.space.contract(torch.from_numpy(frame_far @ back[:3, :3].T + back[:3, 3]))
+        ratio = torch.minimum(
+            inverse / grid.space.rates(there).sqrt(), far / grid.space.rates(there_far).sqrt()
+        ).numpy()
         return finest * np.minimum(ratio, ratio**2) * grid.strides_at(there.numpy())
 
     def grid(self, occupied: np.ndarray) -> OccupancyGrid:

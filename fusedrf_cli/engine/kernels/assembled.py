@@ -65,6 +65,24 @@ def separate_cell(field, cell):
     return colour_locate(field, cell[0])
 
 
+def kept_density(field, grid, index, p, d, scratch):
+    """`density` with a cell of three: 1 says that what sigma hands on of it is in scratch, where a `colour`
+    that follows at once finds it."""
+    sigma, pre, strides, cell = plain_density(field, grid, index, p, d, scratch)
+    return sigma, pre, strides, (cell[0], cell[1], 1)
+
+
+def unkept_cell(field, packed, p):
+    """`unpack_cell` with such a cell, of which nothing is in scratch."""
+    cell = plain_unpack_cell(field, packed, p)
+    return cell[0], cell[1], 0
+
+
+def whole_cell(field, cell):
+    """All of a cell, for a colour's encoding that reads what sigma hands on."""
+    return cell
+
+
 def ray_setup(field, d, scratch):
     """See loops.py."""
     rgb_ray_setup(field, d, scratch)
@@ -239,6 +257,9 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
     templates |= {name: template for name, (template, hook) in OPTIONAL.items() if hook in names}
     shared = colour is density or getattr(colour, "locate", locate) is None
     templates["colour_cell"] = shared_cell if shared else separate_cell
+    if getattr(colour, "READS_SCRATCH", False):
+        plain = {f"plain_{name}": templates[name] for name in ("density", "unpack_cell")}
+        templates |= plain | {"density": kept_density, "unpack_cell": unkept_cell, "colour_cell": whole_cell}
     templates["shown_logits"] = shifted_logits if hasattr(density, "logits") else plain_logits
     names |= {name: renamed(template, name, assembly, {}) for name, template in templates.items()}
     functions = {name: value for name, value in names.items() if isinstance(value, FunctionType)}

@@ -58,14 +58,18 @@ class BoxKind(Kind):
         heeded = {name: value for name, value in options.items() if name in names and value is not None}
         return replace(self.usual, **heeded)
 
+    def shape_at(self, storage: StorageSetting, resolution: tuple[int, int, int]) -> object:
+        """The field's shape for a way at a resolution, by which some are larger."""
+        return self.shape(storage)
+
     def sections(self, storage: StorageSetting, resolution: tuple[int, int, int]) -> Sequence[Section]:
         """See Kind."""
-        parts = self.field.parts_of(self.shape(storage), resolution)
+        parts = self.field.parts_of(self.shape_at(storage, resolution), resolution)
         return [Section(part.name, (*part.shape[:-1], part.columns or part.shape[-1])) for part in parts]
 
     def numbers(self, storage: StorageSetting, resolution: tuple[int, int, int]) -> int:
         """See Kind; with what fills rows and cache lines up."""
-        return self.field.size_of(self.shape(storage), resolution)
+        return self.field.size_of(self.shape_at(storage, resolution), resolution)
 
     def builder(self, scene: ComposedField, request: BuildRequest) -> DistilledBuilder:
         """See Kind."""
@@ -109,7 +113,8 @@ class BoxKind(Kind):
 
     def create(self, plan: Plan, generator: torch.Generator, name: str = "") -> BoxField:
         """See Kind."""
-        field = self.field.create(self.shape(plan.storage), plan.box, plan.resolution, generator)
+        shape = self.shape_at(plan.storage, plan.resolution)
+        field = self.field.create(shape, plan.box, plan.resolution, generator)
         field.name = name
         return field
 

@@ -106,6 +106,21 @@ class Kind:
         """What a field learnt from photos of a box (6,) is, with so many texels on the longest axis."""
         return self.plan_at(box, texels(box, longest), storage)
 
+    def begun(
+        self,
+        box: np.ndarray,
+        longest: int,
+        coarse: int,
+        storage: StorageSetting,
+        generator: torch.Generator,
+        name: str = "",
+    ) -> StoredField:
+        """An untrained field that is to learn from photos of a box (6,), first with `coarse` texels on the
+        longest axis, in the end with `longest`."""
+        whole = not self.field.over_texels
+        field = self.create(self.untrained(box, longest if whole else coarse, storage), generator, name)
+        return field.resampled(box, texels(box, coarse)) if whole else field
+
     def empty(
         self,
         teacher: RadianceField,

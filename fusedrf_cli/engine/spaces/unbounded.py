@@ -28,6 +28,14 @@ REACH = 2.0  # coordinates lie between -REACH and REACH
 # See loops.py: a ray through a place has some hundred samples that weigh next to nothing.
 LEARN_FROM, SHARED_COLOUR_FROM, REST_FROM = 3e-3, 1e-2, 1e-2
 WHOLE = np.array([-REACH] * 3 + [REACH] * 3)
+REGIONS = np.array(
+    [[-1.0] * 3 + [1.0] * 3]
+    + [
+        [side if a == axis else -1 for a in range(3)] + [side + 1 if a == axis else 1 for a in range(3)]
+        for axis in range(3)
+        for side in (-2.0, 1.0)
+    ]
+)  # boxes (7, 6) of the coordinates, of each of which a ray has one piece
 LOOK_AT_BOX = np.array([-0.6] * 3 + [0.6] * 3)  # of the core: what views of all of space look at
 position_at = along
 

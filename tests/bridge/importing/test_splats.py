@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from formats.bundle import OpenBundle
+from formats.errors import UnknownCheckpoint
 from fusedrf_cli import verbs
 from fusedrf_cli.bridge.importing.splats import shells_of
-from fusedrf_cli.errors import InvalidInput
+from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.python import open_scene
 
 
@@ -75,3 +76,35 @@ def test_a_file_without_splats_is_refused(tmp_path):
     with pytest.raises(Exception, match="notes.txt") as caught:
         verbs.import_field(tmp_path / "notes.txt", tmp_path / "out.rfpack")
     assert caught.value.exit_code == InvalidInput.exit_code and not (tmp_path / "out.rfpack").exists()
+
+
+@pytest.mark.parametrize(
+    "words, say",
+    [
+        ({"aabb": (-1, -1, -1, 1, 1, 1)}, "--aabb, --near and --far are for files without a box"),
+        ({"near": 1.0}, "--aabb, --near and --far are for files without a box"),
+        ({"up": (0, 0, 0)}, "0,0,0 is no direction"),
+    ],
+)
+def test_what_does_not_apply_is_refused(tmp_path, words, say):
+    file = splat_file(tmp_path / "balls.splat", np.zeros((3, 3)))
+    with pytest.raises(UsageProblem, match=say):
+        verbs.import_field(file, tmp_path / "balls.rfpack", **words)
+    assert [path.name for path in tmp_path.iterdir()] == ["balls.splat"]
+
+
+def test_a_time_is_said_to_be_of_no_use(tmp_path):
+    file = splat_file(tmp_path / "balls.splat", np.zeros((3, 3)))
+    report = verbs.import_field(file, tmp_path / "balls.rfpack", time=2.0)
+    assert "nothing in it moves, and --time is not used" in report["notes"]
+
+
+def test_a_file_cut_short_and_a_folder_say_what_to_do(tmp_path):
+    file = splat_file(tmp_path / "balls.splat", np.zeros((3, 3)))
+    file.write_bytes(file.read_bytes()[:-5])
+    with pytest.raises(
+        UnknownCheckpoint, match="Gaussian splats, but cut short or of no format that is read"
+    ):
+        verbs.import_field(file, tmp_path / "balls.rfpack")
+    with pytest.raises(UnknownCheckpoint, match="of splats give the file itself"):
+        verbs.import_field(tmp_path, tmp_path / "balls.rfpack")

@@ -2,21 +2,25 @@
 another."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from fusedrf_cli.engine.fields import occupancy
 from fusedrf_cli.engine.fields.occupancy import (
     OccupancyGrid,
     cell_counts,
     harmless_depth,
+    mapped,
     marked_cells,
     overlapped,
     placed_cells,
     transformed_aabb,
 )
 from fusedrf_cli.engine.fields.step_size_grid import StepSizeGrid
-from fusedrf_cli.engine.spaces import unbounded
+from fusedrf_cli.engine.spaces import contracted_linf, unbounded
 from tests.engine.conftest import BOX, points_in
 
 UNIT = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
@@ -168,3 +172,48 @@ def test_steps_in_a_place_are_parts_of_its_own():
         assert spacing[~fine] == pytest.approx(steps[1])
         assert (spacing[fine] <= steps[0] + 1e-6).all()
         assert (spacing[fine] > steps[0] * 7 / 8).all()
+
+
+@pytest.mark.parametrize("scale", [0.3, 30.0])
+def test_cells_that_a_placed_grid_reaches_are_found_from_either_side(monkeypatch, scale):
+    """By its points, and, where these are too many, by the corners of the cells: none is missed."""
+    rng = np.random.default_rng(5)
+    grid = OccupancyGrid(BOX, rng.random((3, 4, 2)) < 0.4)
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    matrix[:3, 3] = 0.7 * scale
+    inside = (
+        grid.centres().repeat(4000, 0) + rng.uniform(-0.5, 0.5, (4000 * grid.occupied.sum(), 3)) * grid.cell
+    )
+    there = mapped(inside @ matrix[:3, :3].T + matrix[:3, 3], unbounded)
+    for most in (occupancy.MOST_POINTS, 0):
+        monkeypatch.setattr(occupancy, "MOST_POINTS", most)
+        found = OccupancyGrid(
+            unbounded.WHOLE, marked_cells(grid, matrix, unbounded.WHOLE, 16, unbounded), unbounded
+        )
+        assert found.contains(there).all() and not found.occupied.all()
+
+
+@pytest.mark.parametrize("space", [unbounded, contracted_linf])
+def test_far_away_a_place_beside_the_middle_is_as_fine_as_one_in_it(space):
+    """There both spaces are drawn together alike, but for the distance of their middles: a cell in which n
+    goes from 13 to 1,000 is not as fine as what a bounded field of the same step needs in it."""
+    whole = OccupancyGrid.full(unbounded.WHOLE, 27, unbounded)
+    pace, aside = StepSizeGrid(whole), np.eye(4)
+    aside[0, 3] = 3
+    needed = pace.needed(whole.occupied, OccupancyGrid.full(unbounded.WHOLE, 1, space), aside, 0.05)
+    n = unbounded.inv_contract(torch.from_numpy(whole.centres())).abs().max(1)[0].numpy()
+    assert (needed[n > 20] > 0.05 * (1 - 4 / 20) ** 2).all() and needed.min() < 0.05 / 9
+    solid = pace.needed(whole.occupied, OccupancyGrid.full(BOX), aside, 0.05)
+    assert solid[n > 20].max() < 0.05 / 20**2
+
+
+def test_samples_of_a_place_are_counted_by_its_regions():
+    """Cells close together stand far out on one side alone, so that a ray's other pieces take few samples."""
+    grid = OccupancyGrid.full(unbounded.WHOLE, 32, unbounded)
+    stride = np.full(grid.occupied.shape, 200, np.uint16)
+    fine = replace(grid, stride=stride.copy(), unit=1e-4)
+    fine.stride[-1, 8:24, 8:24] = 1
+    even = replace(grid, stride=stride, unit=1e-4)
+    apart = 2 * np.sqrt(3) / 1e-4  # through the layer, along it
+    assert 0.99 * apart <= fine.most_samples(1.0) - even.most_samples(1.0) <= apart

@@ -18,8 +18,12 @@ from tests.analytic.export import with_network
 from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, random_vm
 from .sparse_cases import random_sparse
 
-SLOW_TO_COMPILE = {"cp", "dense-mlp", "vm-mlp"}
+SLOW_TO_COMPILE = {"cp", "dense-mlp", "hash", "mlp", "vm-mlp"}
 """Kinds whose loops the quick tests do not wait for, where they try every kind."""
+
+
+SMALL = {"width": 8, "hidden": 8, "levels": 3, "finest": 40, "log2_rows": 6, "count": 2, "colour": 8}
+"""What random fields have of networks and levels."""
 
 
 def random_detail(**kwargs):
@@ -43,8 +47,7 @@ def random_boxed(name: str, dtype=torch.float64, seed=0) -> BoxField:
     """A field of a kind over one box, of random numbers under a random occupancy, dense enough to see."""
     kind = registry.kind(name)
     shape = kind.shape(StorageSetting(ranks=(8, 16)))
-    if hasattr(shape, "hidden"):
-        shape = replace(shape, width=8, hidden=8)
+    shape = replace(shape, **{word: SMALL[word] for word in SMALL if hasattr(shape, word)})
     generator = torch.Generator().manual_seed(seed)
     grid = OccupancyGrid.full(BOX, 4)
     grid = OccupancyGrid(grid.aabb, np.random.default_rng(seed).random(grid.occupied.shape) < 0.4)

@@ -1,0 +1,77 @@
+"""The `hash` field: a hash grid (Instant-NGP, Müller et al. 2022) of which the density is a weighted sum, and
+a small network of its numbers and the direction that makes the colour (K-Planes' explicit density,
+Fridovich-Keil et al., CVPR 2023, sec. 3.3)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusedrf_cli.engine.decoders import density_linear, sh_mlp
+from fusedrf_cli.engine.encodings import hash_grid, trunk_features
+from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
+from fusedrf_cli.engine.settings import current
+
+BASE = 16  # vertices along an axis of the coarsest level
+
+
+@dataclass(frozen=True)
+class HashConfig:
+    """How such a field learns; rates are relative to the optimiser's."""
+
+    rows_rate: float = 2.0
+    density_rate: float = 1.0
+    network_rate: float = 0.1
+
+
+@dataclass(frozen=True)
+class HashShape:
+    """Levels of the grid, numbers of a row, vertices along an axis of the finest level and rows of a level at
+    most, and the width of the network's hidden layer."""
+
+    levels: int = 8
+    features: int = 4
+    finest: int = 512
+    log2_rows: int = 17
+    hidden: int = 32
+
+    def __post_init__(self):
+        """Refuse what the kernels were not written for."""
+        limits = {"levels": (1, 32), "features": (1, 16), "finest": (BASE, 1 << 18), "log2_rows": (3, 24),
+                  "hidden": (8, 256)}  # fmt: skip
+        for name, (low, high) in limits.items():
+            count = getattr(self, name)
+            whole = type(count) is int and low <= count <= high
+            if not whole or (name == "hidden" and count % 8):
+                raise ValueError(f"'{name}' should be a whole number from {low} to {high}, found {count!r}")
+
+    @property
+    def grids(self) -> list[dict]:
+        """The levels, from the coarsest to the finest."""
+        growth = (self.finest / BASE) ** (1 / max(self.levels - 1, 1))
+        return hash_grid.levels_of(self.levels, self.log2_rows, BASE, growth)
+
+
+class HashField(AssembledField):
+    """A hash grid over the cube around a box."""
+
+    kind = "hash"
+    shape_type = HashShape
+    over_texels = False
+
+    @classmethod
+    def slots_of(cls, shape: HashShape) -> dict[str, Slot]:
+        """See AssembledField."""
+        config = current(HashConfig)
+        rows = {"features": shape.features, "levels": shape.grids, "grows": True}
+        width = hash_grid.sizes(**rows)["WIDTH"]
+        return {
+            "density": Slot(hash_grid, rows, "density_", config.rows_rate),
+            "colour": Slot(trunk_features, {"outputs": width}),
+            "sigma": Slot(density_linear, {"width": width}, "sigma_", config.density_rate),
+            "rgb": Slot(sh_mlp, {"width": width, "hidden": shape.hidden}, "rgb_", config.network_rate),
+        }
+
+    @property
+    def cube(self) -> tuple[np.ndarray, np.ndarray]:
+        """See Assembled: the cube at the box's lower corner, as wide as that is on its longest axis."""
+        return self.box[:3].copy(), np.full(3, (self.box[3:] - self.box[:3]).max())

@@ -1,0 +1,15 @@
+"""The `mlp` kind: NeRF's network."""
+
+from fusedrf_cli.engine.kinds.box_kind import BoxKind
+from fusedrf_cli.engine.kinds.mlp.field import MLPField
+
+
+class MLPKind(BoxKind):
+    """See Kind."""
+
+    name = "mlp"
+    good_for = "The fewest bytes, as NeRF has them; slow to learn and to draw."
+    field = MLPField
+
+
+KIND = MLPKind()
