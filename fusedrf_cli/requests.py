@@ -45,12 +45,14 @@ class PoseRequest(Writing):
 
 @dataclass(frozen=True)
 class TrainRequest(Writing, Learning, Sizing):
-    """Photos or a mesh to one field."""
+    """Photos or a mesh to one field, or several of them to a field each, whose decoder is one."""
 
-    source: str
+    source: str | tuple[str, ...]
     output: str
     _: KW_ONLY
-    kind: str = "vm"
+    kind: str | None = None
+    """None: vm, or of fields that share a decoder dense-mlp."""
+    shared_decoder: bool = False
     quality: Literal["draft", "normal", "high", "best"] | None = None
     """None: as the time budget allows."""
     holdout: Annotated[int, Meta(ge=2)] | None = None
@@ -72,6 +74,27 @@ class TrainRequest(Writing, Learning, Sizing):
     refine_poses: bool = False
     """Whether to look for where the photos were taken from, near where they are said to have been."""
     resume: bool = False
+
+    def __post_init__(self):
+        sources = self.sources
+        if len(sources) == 1:
+            object.__setattr__(self, "source", sources[0])
+            if self.shared_decoder:
+                raise UsageProblem("--shared-decoder is of several sources; give another, or leave it out")
+            return
+        if not self.shared_decoder:
+            raise UsageProblem(
+                f"{len(sources)} sources become fields of one bundle only with --shared-decoder; give it, or "
+                "train them one by one"
+            )
+        own = {"--aabb": self.aabb, "--centre": self.centre, "--radius": self.radius}
+        if wrong := [option for option, value in own.items() if value is not None]:
+            raise UsageProblem(f"{wrong[0]} is of one capture's world, and {len(sources)} are given")
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """One or several."""
+        return self.source if isinstance(self.source, tuple) else (self.source,)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -75,6 +75,8 @@ def _plain(value: Any) -> Any:
     """Paths as text, and arrays as lists."""
     if isinstance(value, os.PathLike):
         return os.fspath(value)
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
     return value.tolist() if hasattr(value, "tolist") else value
 
 

@@ -16,7 +16,7 @@ from fusedrf_cli.bridge.kind_list import list_kinds
 from fusedrf_cli.bridge.posing import pose
 from fusedrf_cli.bridge.rendering import render
 from fusedrf_cli.bridge.replacing import replace
-from fusedrf_cli.bridge.training import train
+from fusedrf_cli.bridge.trained_sources import train
 from fusedrf_cli.bridge.transforming import add, duplicate, move, rename, show
 
 __all__ = [

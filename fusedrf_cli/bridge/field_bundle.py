@@ -1,5 +1,6 @@
-"""A bundle of one field."""
+"""A bundle of fields as they were made."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,26 +33,49 @@ def write_field(
     origin: np.ndarray | None = None,
     about: SceneGraph = SceneGraph(()),
 ) -> int:
-    """Write one field as a bundle; its node is placed at `origin`: a position (3,), or a placement (4, 4). Of
-    a field that holds several objects each becomes a node. Returns the bytes written. History, framing and
-    cameras are those of `about`."""
+    """`write_fields` of one field; its node is placed at `origin`: a position (3,), or a placement (4, 4)."""
+    return write_fields(
+        output, {name: field}, {name: origin}, precision=precision, overwrite=overwrite, about=about
+    )
+
+
+def write_fields(
+    output: str,
+    fields: Mapping[str, StoredField],
+    origins: Mapping[str, np.ndarray | None],
+    *,
+    precision: str,
+    overwrite: bool,
+    about: SceneGraph,
+) -> int:
+    """Write fields as a bundle, a node of its name each, placed at its origin. Of a field that holds several
+    objects each becomes a node. Returns the bytes written. History, framing and cameras are those of
+    `about`."""
     writer = BundleWriter()
-    member = writer.add_field(FieldRecord(field.kind, *field.state()), precision)
-    graph = writer.unfolded(graph_of(member, name, origin, about))
+    members = {
+        name: writer.add_field(FieldRecord(field.kind, *field.state()), precision)
+        for name, field in fields.items()
+    }
+    graph = writer.unfolded(graph_of(members, origins, about))
     writer.write(output, graph, overwrite=overwrite)
     return Path(output).stat().st_size
 
 
-def graph_of(member: str, name: str, origin: np.ndarray | None, about: SceneGraph) -> SceneGraph:
-    """The scene of a bundle of one field; see `write_field`."""
-    node = make_node(name, field=member, **({} if origin is None else placement_of(placement(origin))))
-    return replace(about, nodes=(node,), generator=f"fusedrf {__version__}")
+def graph_of(
+    members: Mapping[str, str], origins: Mapping[str, np.ndarray | None], about: SceneGraph
+) -> SceneGraph:
+    """The scene of a bundle of fields, which are its members; see `write_fields`."""
+    nodes = tuple(
+        make_node(name, field=member, **({} if at is None else placement_of(placement(at))))
+        for (name, member), at in zip(members.items(), map(origins.get, members), strict=True)
+    )
+    return replace(about, nodes=nodes, generator=f"fusedrf {__version__}")
 
 
-def check_graph(output: str, name: str, origin: np.ndarray | None, about: SceneGraph) -> None:
-    """Before a field is learnt: raise what `write_field` would because of where it lies and what is kept
-    with it."""
+def check_graph(output: str, origins: Mapping[str, np.ndarray | None], about: SceneGraph) -> None:
+    """Before fields are learnt: raise what `write_fields` would because of where they lie and what is kept
+    with them."""
     try:
-        dump_scene(graph_of(NO_MEMBER, name, origin, about))
+        dump_scene(graph_of(dict.fromkeys(origins, NO_MEMBER), origins, about))
     except FormatError as error:
         raise error.within(output) from error

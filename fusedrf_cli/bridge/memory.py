@@ -68,6 +68,7 @@ class MemoryConfig:
 
 
 FLOAT = 4
+OCCUPANCY = "its occupancy"
 
 
 class Memory:
@@ -201,7 +202,17 @@ def fitting(plan: Plan, longest: int, threads: int, unbounded: bool) -> dict[str
     occupancy is made anew."""
     grid = np.prod(cell_counts(plan.box, min(current(OccupancyConfig).cells, longest)))
     learns = learning(plan.numbers, threads, 1 if unbounded else 2)
-    return {**learns, "its occupancy": float(grid) * current(MemoryConfig).per_tried_cell}
+    return {**learns, OCCUPANCY: float(grid) * current(MemoryConfig).per_tried_cell}
+
+
+def together(*fits: Mapping[str, float]) -> dict[str, float]:
+    """What several fits need that take turns: all that each needs, but one occupancy at a time."""
+    parts: dict[str, float] = {}
+    for fit in fits:
+        for what, needed in fit.items():
+            before = parts.get(what, 0.0)
+            parts[what] = max(before, needed) if what == OCCUPANCY else before + needed
+    return parts
 
 
 def teaching(settings: DistilConfig, points: int) -> dict[str, float]:

@@ -1,41 +1,20 @@
-"""`train`: photos or a mesh to one field."""
+"""How `train` fits a field to one source: what is read, and the settings and needs that follow from it."""
 
-import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from formats.atomic import check_space
 from formats.meshes import is_mesh, mesh_capture
 from formats.photos import load_photos, loading_bytes
-from formats.scene import SceneGraph
 from formats.views import Capture, check_parallax, hold_out
-from fusedrf_cli.bridge.capture_cameras import cameras_of_capture
-from fusedrf_cli.bridge.depth_supervision import known_points
-from fusedrf_cli.bridge.field_bundle import check_graph, stored, write_field
-from fusedrf_cli.bridge.holdout_evaluation import measure, warn_of_holdout
-from fusedrf_cli.bridge.memory import Memory, decoding, fitting, photos
+from fusedrf_cli.bridge.memory import decoding, fitting, photos
 from fusedrf_cli.bridge.pictures import camera_of
-from fusedrf_cli.bridge.pose_refinement import aligned, moved, with_poses
 from fusedrf_cli.bridge.posing import posed_capture
-from fusedrf_cli.bridge.runtime import (
-    check_checkpoint,
-    checkpoint_mismatch,
-    checkpoint_path,
-    engine,
-    load_checkpoint,
-    resumable,
-    take_up,
-    without_interrupts,
-    written_somewhere,
-)
 from fusedrf_cli.bridge.scene import refuse_options, unusable_kind
-from fusedrf_cli.bridge.scene_bounds import SceneBounds, check_flatness, scene_bounds_of
-from fusedrf_cli.bridge.sizes import BundleSizes, HeaderConfig, camera_bytes, section_bytes
+from fusedrf_cli.bridge.scene_bounds import SceneBounds
+from fusedrf_cli.bridge.sizes import BundleSizes, HeaderConfig, section_bytes
 from fusedrf_cli.engine.distillation.config import TrainConfig
-from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.ray_dataset import Pictures
 from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, cell_counts
@@ -44,7 +23,7 @@ from fusedrf_cli.engine.kinds.builder import BuilderConfig, Plan, Section, Stora
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces.unbounded import REACH
-from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
+from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import TrainRequest
 
@@ -106,109 +85,12 @@ class TrainPresets:
     a minute what they do in ten."""
 
 
-def train(request: TrainRequest, progress) -> dict:
-    """Fit one field to a capture and write it; with `holdout` every N-th view only measures."""
-    with engine(request.device, request.threads, progress) as device:
-        memory = Memory(request.memory)
-        check_checkpoint(request.output, request.resume, request.overwrite)
-        saved = load_checkpoint(request.output, "train") if request.resume else None
-        kind = trained_kind(request)
-        progress.phase("reading", None)
-        capture = read_views(request, progress)
-        cut_out = masks_object(request, capture)
-        bounds = scene_bounds_of(request, capture, cut_out)
-        check_flatness(bounds)
-        suits = current(TrainPresets).unbounded_precision if bounds.unbounded else "float16"
-        request = replace(request, precision=request.precision or suits)
-        camera_content = cameras_of_capture(capture, cut_out, progress)
-        check_graph(
-            request.output, Path(request.output).stem, bounds.origin, SceneGraph((), cameras=camera_content)
-        )
-        settings = fit_settings(request, kind, capture, bounds, device, camera_bytes(camera_content))
-        plan = kind.untrained(bounds.box, settings.longest, settings.storage)
-        check_space(request.output, bytes_of(plan, request.precision) + camera_bytes(camera_content))
-        memory.expect(
-            loading(capture),
-            fit_memory(capture, plan, settings),
-            advice="use a smaller --max-size, fewer or smaller photos, or a lower --quality",
-        )
-        cameras = [bounds.camera(camera_of(v)) for v in capture.train]
-        pictures = pictures_of(request, capture)
-        depth_points = known_points(capture, bounds)
-        name = Path(request.source).resolve().stem
-        run = FitRun.start(cameras, pictures, bounds.box, settings, name, bounds.cells, depth_points)
-        if saved:
-            if saved[1].get("kind") != kind.name:
-                raise checkpoint_mismatch(request.output)
-            take_up(run, saved, request.output)
-        field, seconds = _run(run, request.output, progress)
-        with without_interrupts(request.output):  # what was learnt comes before what is found out about it
-            if settings.poses:
-                capture = with_poses(capture, bounds, run.pool.poses)
-                camera_content = cameras_of_capture(capture, cut_out, progress)
-            size = written_somewhere(
-                request.output,
-                lambda output: write_field(
-                    output,
-                    field,
-                    Path(request.output).stem,
-                    precision=request.precision,
-                    overwrite=request.overwrite,
-                    origin=bounds.origin,
-                    about=SceneGraph((), cameras=camera_content),
-                ),
-            )
-            checkpoint_path(request.output).unlink(missing_ok=True)
-        progress.phase("measuring", None)
-        measured = None
-        if request.holdout:
-            written = stored(field, request.precision)
-            measured = measure(written, capture, pictures, bounds.origin, run.psnr)
-            if settings.poses:
-                measured["aligned"] = aligned(written, capture, bounds, settings.near, request.seed)
-            if capture.kind != "mesh":
-                warn_of_holdout(request.output, measured, progress)
-    report = {
-        "output": request.output,
-        "bytes": size,
-        "kind": field.kind,
-        "views": len(capture.train),
-        "capture": capture.summary(),
-        **bounds.report(),
-        "steps": run.steps,
-        **kind.describe(field),
-        "seconds": {"training": seconds},
-        "training_psnr": run.psnr,
-        "holdout": measured,
-        "depths_of_points": run.depth_points and len(run.depth_points.points),
-        "exposure": exposure(run),
-        "poses": moved(run, cameras, bounds) if settings.poses else None,
-        "memory": memory.report(),
-        **run.nan_guard.figures(),
-    }
-    reached, target = measured["psnr"] if measured else run.psnr, request.target_psnr
-    if target is not None and reached < target:
-        raise QualityNotReached(
-            f"{request.output}: reached {reached:.2f} dB where --target-psnr asked for {target:g}; give more "
-            "--time-budget or --quality best",
-            report=report,
-        )
-    return report
-
-
-def exposure(run: FitRun) -> dict[str, float] | None:
-    """The gains of the darkest and the brightest photo, over their geometric mean, where photos were found
-    to differ."""
-    if run.maps is None:
-        return None
-    gains = np.exp(np.log(run.maps[:, 0]).mean(1) - np.log(run.maps[:, 0]).mean())
-    return {"darkest": float(gains.min()), "brightest": float(gains.max())}
-
-
 def trained_kind(request: TrainRequest) -> Kind:
-    """The kind that was asked for; UsageProblem where none of its fields can begin from photos."""
+    """The kind that was asked for; UsageProblem where none of its fields can begin from photos, or share what
+    they are to share."""
+    usual = registry.SHARING if request.shared_decoder else registry.DEFAULT
     try:
-        kind = registry.kind(request.kind)
+        kind = registry.kind(request.kind or usual)
     except ValueError as error:
         raise unusable_kind(error) from error
     if not kind.trains:
@@ -216,6 +98,12 @@ def trained_kind(request: TrainRequest) -> Kind:
         raise UsageProblem(
             f"--kind {kind.name} does not begin from photos: train another kind ({', '.join(others)}), and "
             f"fuse it to '{kind.name}'"
+        )
+    if request.shared_decoder and kind.shared_part is None:
+        others = [k.name for k in registry.kinds() if k.trains and k.shared_part is not None]
+        raise UsageProblem(
+            f"--kind {kind.name} has no decoder that fields can share; with --shared-decoder take "
+            f"{' or '.join(others)}"
         )
     refuse_options(kind, request)
     return kind
@@ -360,22 +248,6 @@ def fit_memory(capture: Capture, plan: Plan, settings: TrainConfig) -> dict[str,
         **photos(len(capture.train), pixels, 1, cameras, any(view.mask_path for view in capture.train)),
         **fitting(plan, settings.longest, torch.get_num_threads(), settings.unbounded),
     }
-
-
-def _run(run: FitRun, output: str, progress) -> tuple[object, float]:
-    """Train to the end; an interrupt leaves a checkpoint and goes on its way."""
-    progress.phase("training", 1.0)
-    started = time.monotonic()
-    with resumable(output, run.checkpoint, lambda: run.held, progress) as uninterrupted:
-        field = run.finish(lambda share, figures: progress.advance(share, **figures), uninterrupted)
-    run.forget()
-    warn_of_nonfinite(run.nan_guard.figures(), progress)
-    if not run.found_density:
-        progress.warn(
-            f"{output}: no density was found, so that all of the box was kept; look at the photos' alpha, "
-            "their poses, and --aabb"
-        )
-    return field, time.monotonic() - started
 
 
 def warn_of_nonfinite(figures: dict[str, int], progress) -> None:

@@ -1,4 +1,4 @@
-"""`fusedrf train`: posed photos, or a mesh, to one field."""
+"""`fusedrf train`: posed photos, or a mesh, to one field; or several to fields that share a decoder."""
 
 import click
 
@@ -15,10 +15,15 @@ from fusedrf_cli.requests import TrainRequest
 
 
 @click.command("train")
-@click.argument("source", type=InputType())
-@options.writing("The field to write, FIELD.rfpack.")
+@click.argument("source", metavar="SOURCE...", nargs=-1, required=True, type=InputType())
+@options.writing("The bundle to write, FIELD.rfpack.")
 @click.option(
-    "--kind", type=FieldKindType(), default=TrainRequest.kind, show_default=True, help="Kind of field."
+    "--kind", type=FieldKindType(), help="Kind of field; default: vm, with --shared-decoder dense-mlp."
+)
+@click.option(
+    "--shared-decoder",
+    is_flag=True,
+    help="Learn a field of each SOURCE, all of which have one decoder of colours.",
 )
 @options.ranks
 @options.sh_degree
@@ -82,8 +87,12 @@ def command(**words):
     transforms.json, or a .glb, .gltf, .obj, .ply, .stl or .off mesh. Photos without poses are posed first,
     as by `fusedrf pose`.
 
+    Of several SOURCEs, with --shared-decoder, each becomes a node in the frame of its own capture. They learn
+    in turns, for --time-budget together, and have equal parts of --max-size.
+
     \b
     Example:
       fusedrf train photos/ -o chair.rfpack
+      fusedrf train photos/ table.glb --shared-decoder -o both.rfpack
     """
     return verbs.train(**words)

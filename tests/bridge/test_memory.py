@@ -19,7 +19,7 @@ import torch
 from formats.bundle import OpenBundle, read_bundle
 from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge import memory, training
+from fusedrf_cli.bridge import memory, trained_sources
 from fusedrf_cli.bridge.field_bundle import write_field
 from fusedrf_cli.bridge.field_cache import FieldCache
 from fusedrf_cli.bridge.memory import Memory
@@ -62,7 +62,7 @@ def test_too_much_is_refused_with_the_numbers(run, folder, name):
 
 def test_moments_and_gradients_are_gone_before_a_field_is_measured(run, folder, monkeypatch):
     """They are six times its numbers, and measuring makes copies of those."""
-    made, alive, begin, measure = [], [], Adam.__init__, training.measure
+    made, alive, begin, measure = [], [], Adam.__init__, trained_sources.measure
 
     def begun(self, *words, **more):
         made.append(weakref.ref(self))
@@ -73,7 +73,7 @@ def test_moments_and_gradients_are_gone_before_a_field_is_measured(run, folder, 
         return measure(*words)
 
     monkeypatch.setattr(Adam, "__init__", begun)
-    monkeypatch.setattr(training, "measure", noted)
+    monkeypatch.setattr(trained_sources, "measure", noted)
     words = "--holdout", "4", "--time-budget", "1"
     result = run("train", "photos", "-o", "out.rfpack", *words)
     assert result.exit_code == 0, result.stderr

@@ -383,7 +383,7 @@ def test_an_interrupt_while_measuring_loses_nothing(run, folder, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(part("training"), "measure", stop)
+    monkeypatch.setattr(part("trained_sources"), "measure", stop)
     result = run("train", "photos", "-o", "out.rfpack", *WORDS, "--holdout", "4")
     assert result.exit_code == 130 and "out.rfpack is written whole" in result.stderr
     read_bundle(folder / "out.rfpack")

@@ -46,7 +46,7 @@ def test_the_group_lists_exit_codes_and_commands_in_the_order_of_work(run):
 def test_help_shows_an_example_that_runs(run, bridge, folder, name):
     result = run(name, "--help")
     assert result.exit_code == 0 and result.stderr == ""
-    for file in ("scene.json", "fused.rfpack", "lego.th", "lamp.rfpack", "photos", "masks"):
+    for file in ("scene.json", "fused.rfpack", "lego.th", "lamp.rfpack", "photos", "masks", "table.glb"):
         (folder / file).write_bytes((folder / "chair.rfpack").read_bytes())
     assert run("compose", "chair.rfpack", "-w", "-o", "scene.json").exit_code == 0
     if name == "undo":

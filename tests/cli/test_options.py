@@ -147,7 +147,8 @@ def test_train_hands_on_what_was_asked(run, bridge):
         "source": "chair.rfpack",
         "output": "out",
         "ranks": None,
-        "kind": "vm",
+        "kind": None,
+        "shared_decoder": False,
         "sh_degree": None,
         "max_size": 1_000_000,
         "target_psnr": None,
@@ -166,6 +167,28 @@ def test_train_hands_on_what_was_asked(run, bridge):
         "refine_poses": False,
         "resume": False,
     }
+
+
+def test_train_takes_several_sources_that_share_a_decoder(run, bridge):
+    run("train", "chair.rfpack", "table.rfpack", "--shared-decoder", "-o", "out")
+    assert bridge.call[1]["source"] == ("chair.rfpack", "table.rfpack") and bridge.call[1]["shared_decoder"]
+
+
+@pytest.mark.parametrize(
+    "words, says",
+    [
+        (("table.rfpack",), "2 sources become fields of one bundle only with --shared-decoder"),
+        (("table.rfpack", "chair.rfpack"), "3 sources"),
+        (("--shared-decoder",), "--shared-decoder is of several sources"),
+        (("table.rfpack", "--shared-decoder", "--aabb", "0,0,0,1,1,1"), "--aabb is of one capture's world"),
+        (("table.rfpack", "--shared-decoder", "--centre", "0,0,0"), "--centre is of one capture's world"),
+        (("table.rfpack", "--shared-decoder", "--radius", "2"), "--radius is of one capture's world"),
+    ],
+)
+def test_sources_that_do_not_go_together_are_refused(run, bridge, words, says):
+    result = run("train", "chair.rfpack", *words, "-o", "out")
+    assert result.exit_code == 2 and says in result.stderr and result.stderr.count("\n") == 1
+    assert bridge.call is None
 
 
 def test_fuse_hands_on_a_scene_by_pipe(run, bridge):

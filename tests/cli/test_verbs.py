@@ -104,6 +104,8 @@ def test_a_word_of_another_kind_is_refused(bridge, folder, words, says):
 
 
 def test_paths_and_arrays_are_words(bridge, folder):
+    verbs.train([folder / "chair.rfpack", "table.rfpack"], Path("out"), shared_decoder=True)
+    assert bridge.call[1]["source"] == (str(folder / "chair.rfpack"), "table.rfpack")
     place = np.eye(4) * [2, 2, 2, 1]
     words = {"name": "a", "matrix": place, "memory": np.int64(3)}
     verbs.add(folder / "chair.rfpack", "table.rfpack", Path("out"), **words)

@@ -169,7 +169,7 @@ def test_what_a_bundle_keeps_stays_in_it(folder):
     member = writer.add_field(FieldRecord(field.kind, *field.state()), "float16")
     writer.copy_field(folder / "red.rfpack", red.member)
     about = SceneGraph((), history=({"event": "fused"},))
-    writer.write("kept.rfpack", graph_of(member, "blue", None, about), overwrite=False)
+    writer.write("kept.rfpack", graph_of({"blue": member}, {}, about), overwrite=False)
     open_scene("kept.rfpack").save("again.rfpack")
     assert Path("again.rfpack").read_bytes() == Path("kept.rfpack").read_bytes()
 

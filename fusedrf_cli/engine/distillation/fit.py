@@ -127,19 +127,27 @@ class FitRun:
         divergence."""
         while (share := self.share()) < 1.0 and not self.reached():
             with uninterrupted():
-                if self.due(share):
-                    self.held = deepcopied(*self.checkpoint())
-                    self.refresh(share)
-                    self.held = None
-                self.step(share)
+                self.turn(share)
             if self.steps % 20 == 0:
                 advance(share, {"psnr": self.psnr})
         with uninterrupted():
-            if self.refreshes:  # not where the run was interrupted after it
-                self.held = deepcopied(*self.checkpoint())
-                self.refreshes.clear()
-                self.nan_guard.check()
-                self.refresh_occupancy()
+            return self.end()
+
+    def turn(self, share: float) -> None:
+        """What is due after that share of the run, and one step."""
+        if self.due(share):
+            self.held = deepcopied(*self.checkpoint())
+            self.refresh(share)
+            self.held = None
+        self.step(share)
+
+    def end(self) -> StoredField:
+        """The field after its last step, its occupancy made anew."""
+        if self.refreshes:  # not where the run was interrupted after it
+            self.held = deepcopied(*self.checkpoint())
+            self.refreshes.clear()
+            self.nan_guard.check()
+            self.refresh_occupancy()
         self.held = None
         return self.field
 
@@ -167,6 +175,8 @@ class FitRun:
             "rotation": self.pool.rotation.numpy(),
             "position": self.pool.position.numpy(),
         }
+        if any(group.lines is not None for group in self.field.groups()):
+            arrays["params"] = self.field.params.cpu().numpy()  # cells may reach what `state` leaves out
         if self.maps is not None:
             arrays["exposure"] = self.maps
         order, drawn = self.pool.shuffle.state()
@@ -198,6 +208,8 @@ class FitRun:
         """Take up a run that `checkpoint` saved, over the same pictures and config. Raises ValueError,
         KeyError, TypeError or RuntimeError for what is none."""
         self.field = type(self.field).from_state(part_of(arrays, "field."), state["field"])
+        if "params" in arrays:
+            self.field.params.copy_(torch.from_numpy(alike(arrays["params"], self.field.params, "params")))
         self.field = self.field.to(self.config.device)
         self.optimiser = self.fresh_optimiser()
         self.optimiser.restore(arrays, state["adam_steps"])

@@ -49,6 +49,9 @@ class Kind:
     """Which of them `reduction` heeds."""
     hashes = False
     """Whether its fields may have a hashed detail (`StorageSetting.hashed`)."""
+    shared_part: str | None = None
+    """What the names of those sections begin with, before a dot, that fields which are trained together may
+    have in common (see `sharing`): a decoder. None: there are none."""
     warm_starts = False
     """Whether a student may start as the scene's background (`warm_start`)."""
     beside_background = True
@@ -130,6 +133,10 @@ class Kind:
         occupancy."""
         plan = self.plan(teacher.occupancy.aabb, teacher.voxel_size, storage, most)
         return self.create(plan, generator, name).with_occupancy(teacher.occupancy)
+
+    def sharing(self, field: StoredField) -> StoredField:
+        """A field whose `shared_part` is other fields' as well, and so learns no further."""
+        raise NotImplementedError
 
     # -- standing for a scene --------------------------------------------------------------------------------
 

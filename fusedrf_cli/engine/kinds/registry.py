@@ -21,6 +21,7 @@ WAYS = {INSTANCES: f"{__package__}.instances"}
 IMPORTED = frozenset({"assembled", "splats"})
 """Kinds that other systems' files become; nothing is learnt as one of them."""
 DEFAULT = "vm"  # what photos become where no kind is named
+SHARING = "dense-mlp"  # what photos of several captures become that share a decoder
 
 
 class UnknownKind(ValueError):
