@@ -228,7 +228,7 @@ def test_a4_the_red_front_is_seen_from_the_front(row, kind):
 
 def test_a9_one_matrix_is_the_only_truth(row, kind):
     """Shading after turn and scale follows from the one matrix; there is no second rotation to give."""
-    placing = {"name", "field", "opacity", "tint"}
+    placing = {"name", "field", "opacity", "tint", "crops"}
     assert set(inspect.signature(Placed).parameters) - placing == {"object_to_world"}
     with pytest.raises(FormatError, match="expected one of them"):
         make_node("a", source="a.rfpack", matrix=np.eye(4).tolist(), rotation=[0, 0, 0, 1])

@@ -1,6 +1,6 @@
 """A small random field of each kind, in float64, dense enough to see."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 
 import numpy as np
@@ -47,7 +47,8 @@ def random_boxed(name: str, dtype=torch.float64, seed=0) -> BoxField:
     """A field of a kind over one box, of random numbers under a random occupancy, dense enough to see."""
     kind = registry.kind(name)
     shape = kind.shape(StorageSetting(ranks=(8, 16)))
-    shape = replace(shape, **{word: SMALL[word] for word in SMALL if hasattr(shape, word)})
+    words = {field.name for field in fields(shape)} & SMALL.keys()
+    shape = replace(shape, **{word: SMALL[word] for word in words})
     generator = torch.Generator().manual_seed(seed)
     grid = OccupancyGrid.full(BOX, 4)
     grid = OccupancyGrid(grid.aabb, np.random.default_rng(seed).random(grid.occupied.shape) < 0.4)
