@@ -14,7 +14,7 @@ from fusedrf_cli.engine.composition.differentiable import query
 from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
-from fusedrf_cli.engine.spaces import bounded, unbounded
+from fusedrf_cli.engine.spaces import bounded, contracted_l2, contracted_linf, ndc, unbounded
 from tests.analytic.export import exported
 from tests.analytic.fields import BOX, Box, chord_of_box
 from tests.analytic.rays import affine, moved_rays, points_in, rays_at, turn, unit
@@ -29,6 +29,8 @@ from tests.engine.composition.test_composite import (
     some_rays,
     surroundings,
 )
+from tests.engine.spaces.test_contractions import hashed_in
+from tests.engine.spaces.test_contractions import some_rays as space_rays
 
 FIELDS = {"vm": lambda: blob("vm"), "all of space": surroundings}
 AT = affine(TURNED)
@@ -196,6 +198,25 @@ def test_a_far_crop_of_all_of_space_shows_its_samples():
     assert (np.abs(whole - found)[:, 3] > 0.01).mean() > 0.5 and wanted[:, 3].max() > 0.1
     same = np.abs(found - wanted)[:, :4].max(1) < 3e-3
     assert same.mean() > 0.98 and np.abs(found - wanted)[same][:, 3].max() < 2e-5
+
+
+@pytest.mark.slow  # loops of each space are compiled
+@pytest.mark.parametrize("space", [contracted_l2, contracted_linf, ndc], ids=["L2", "Linf", "NDC"])
+def test_crops_are_of_the_frame_where_its_rays_are_curved(space):
+    """A ball around half of the places that a field has numbers for."""
+    field = hashed_in(space, torch.float32)
+    rays_o, rays_d = space_rays(space, 200)
+    places = space.inv_contract(torch.from_numpy(field.occupancy.centres())).numpy()
+    middle = np.median(places, 0)
+    crops = Crops((Crop.of((*middle, np.median(np.linalg.norm(places - middle, axis=1))), np.eye(4)),))
+    wanted = slowly(field, crops, rays_o, rays_d)
+    scene = Composite([Placed("one", field, np.eye(4), crops=crops)], origin=np.eye(4))
+    found = render_rays(scene, rays_o, rays_d, early_stop=0.0)
+    uncropped = Composite([Placed("one", field, np.eye(4))], origin=np.eye(4))
+    whole = render_rays(uncropped, rays_o, rays_d, early_stop=0.0)
+    assert wanted[:, 3].max() > 0.05 and (np.abs(whole - wanted)[:, 3] > 0.01).mean() > 0.1
+    same = np.abs(found - wanted)[:, :4].max(1) < 3e-3
+    assert same.mean() > 0.95 and np.abs(found - wanted)[same][:, 3].max() < 1e-3
 
 
 @pytest.mark.parametrize("kind", ["vm", "sparse", "all of space"])
