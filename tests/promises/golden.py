@@ -55,6 +55,8 @@ class Case:
     edits: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Command lines by name: a verb and its words, of which FUSED is the bundle; `-o` is put behind."""
     bar: float = 55.0
+    cropped: bool = False
+    """Whether it has crops, which were rounded inwards to cells when it was kept, and are exact now."""
     """PSNR in dB to which the picture is kept."""
     others: tuple[Callable[[Path], None], ...] = ()
     """Bundles that may answer as this one does; points where one does not are not asked."""
@@ -681,7 +683,10 @@ CASES |= {
     "nodes-max": Case(nodes_of_kinds("max")),
     "nodes-add": Case(nodes_of_kinds("add")),
     "nodes-shown": Case(
-        shown_nodes, bar=25.0, others=(partial(shown_nodes, less=0.25), partial(shown_nodes, less=-0.25))
+        shown_nodes,
+        bar=24.0,
+        cropped=True,
+        others=(partial(shown_nodes, less=0.25), partial(shown_nodes, less=-0.25))
     ),
     "far-blocks": Case(
         far_blocks, tuple(FAR + [2100, -1600, 1300]), tuple(FAR), around(1000.0, FAR),
