@@ -183,8 +183,9 @@ def camera_of_all(placed: list[Placed], size: int) -> Camera:
 
 
 def held_bytes(placed: list[Placed]) -> int:
-    """Of the numbers and cells of fields."""
-    return sum(p.field.params.nbytes + p.field.occupancy.skip.nbytes for p in placed)
+    """Of the numbers that fields hold, and of their cells; vertices that nothing reaches take no memory."""
+    numbers = sum(array.nbytes for p in placed for array in p.field.state()[0].values())
+    return numbers + sum(p.field.occupancy.skip.nbytes for p in placed)
 
 
 def frame_seconds(scene: ComposedField, camera: Camera, frames: int) -> float:
