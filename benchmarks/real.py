@@ -8,7 +8,6 @@ not hold stay as they were. Rendered pictures (with alpha) and photos without po
 
 import argparse
 import csv
-import statistics
 import tempfile
 import time
 from collections.abc import Iterator
@@ -21,7 +20,7 @@ from PIL import Image
 from benchmarks.commit import commit_column, commit_line
 from benchmarks.paper.figures import over_time
 from benchmarks.paper.table import markdown
-from benchmarks.paper.work import fusedrf, stored_rows, tell, write_csv
+from benchmarks.paper.work import fusedrf, median_frame, stored_rows, tell, write_csv
 from formats.captures import is_capture, read_capture
 from formats.errors import FormatError
 from formats.views import Capture, View, hold_out
@@ -113,12 +112,7 @@ def frame_seconds(field: Path, view: View) -> float:
     shown, origin = renderable(load_scene(str(field)))
     wide = config.frame_width
     camera = camera_of(view.reframed(wide, round(wide * view.height / view.width)))
-    took = []
-    for _ in range(1 + config.frames):
-        started = time.perf_counter()
-        render_image(shown, camera, origin=origin)
-        took.append(time.perf_counter() - started)
-    return statistics.median(took[1:])
+    return median_frame(shown, camera, origin, config.frames)
 
 
 def write_pair(field: Path, view: View, path: Path) -> None:

@@ -16,9 +16,7 @@ Rows that a run leaves out stay as they were, each with its commit.
 
 import argparse
 import csv
-import statistics
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
@@ -31,14 +29,14 @@ from benchmarks.commit import commit_column, commit_line
 from benchmarks.paper.figures import over_time
 from benchmarks.paper.sources import four_objects
 from benchmarks.paper.table import markdown
-from benchmarks.paper.work import Work, course, fusedrf, tell, write_csv
+from benchmarks.paper.work import Work, course, fusedrf, median_frame, tell, write_csv
 from fusedrf_cli import plots
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import Composite
 from fusedrf_cli.engine.distillation.occupancy_update import occupancy_of
-from fusedrf_cli.engine.fields.occupancy import texels
+from fusedrf_cli.engine.fields.occupancy import enclosing, texels
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.vm.field import VMField
@@ -177,8 +175,7 @@ def copies(field: Placed, count: int) -> list[Placed]:
 
 def camera_of_all(placed: list[Placed], size: int) -> Camera:
     """A camera that frames fields."""
-    boxes = np.stack([p.aabb for p in placed])
-    box = np.concatenate([boxes[:, :3].min(0), boxes[:, 3:].max(0)])
+    box = enclosing([p.aabb for p in placed])
     return framing_camera(box, 0.9, 0.45, size, size)
 
 
@@ -186,16 +183,6 @@ def held_bytes(placed: list[Placed]) -> int:
     """Of the numbers that fields hold, and of their cells; vertices that nothing reaches take no memory."""
     numbers = sum(array.nbytes for p in placed for array in p.field.state()[0].values())
     return numbers + sum(p.field.occupancy.skip.nbytes for p in placed)
-
-
-def frame_seconds(scene: ComposedField, camera: Camera, frames: int) -> float:
-    """The median of so many frames, after one that loads kernels."""
-    took = []
-    for _ in range(1 + frames):
-        started = time.perf_counter()
-        render_image(scene, camera, origin=scene.origin)
-        took.append(time.perf_counter() - started)
-    return statistics.median(took[1:])
 
 
 def composed(run: Run) -> None:
@@ -208,8 +195,9 @@ def composed(run: Run) -> None:
         for count in NUMBERS:
             placed = copies(replace(one, field=opened(one.field)), count)
             camera = camera_of_all(placed, config.frame)
-            naive = frame_seconds(ComposedField(placed), camera, 1)
-            frame = frame_seconds(Composite(placed), camera, config.frames)
+            whole, alone = Composite(placed), ComposedField(placed)
+            naive = median_frame(alone, camera, alone.origin, 1)
+            frame = median_frame(whole, camera, whole.origin, config.frames)
             held = held_bytes(placed) / 1e6
             run.note(
                 "composed", {"kind": kind, "N": count, "MB held": held, "frame, s": frame, "naive, s": naive}
@@ -266,8 +254,7 @@ def converted(run: Run) -> None:
 
 def concatenated(placed: list[Placed]) -> VMField:
     """One field with the components of all, each on the grid over them all."""
-    boxes = np.stack([p.aabb for p in placed])
-    box = np.concatenate([boxes[:, :3].min(0), boxes[:, 3:].max(0)])
+    box = enclosing([p.aabb for p in placed])
     voxel = min(p.field.voxel_size for p in placed)
     resolution, wide = texels(box, int(np.ceil((box[3:] - box[:3]).max() / voxel))), []
     for p in placed:
@@ -309,7 +296,7 @@ def others(run: Run) -> None:
         for way, scene in ways.items():
             held = whole.params.nbytes if way == "ranks" else held_bytes(placed)
             alike = "" if way == "composite" else f"{psnr(shown[way], shown['composite']):.1f}"
-            frame = frame_seconds(scene, camera, config.frames)
+            frame = median_frame(scene, camera, scene.origin, config.frames)
             run.note(
                 "others",
                 {"way": way, "N": count, "MB held": held / 1e6, "frame, s": frame, "PSNR": alike},

@@ -4,14 +4,18 @@ import contextlib
 import csv
 import io
 import json
+import statistics
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fusedrf_cli.bridge.charting import Benchmark
+import numpy as np
+
+from fusedrf_cli.bridge.charting import Benchmark, frame_seconds
 from fusedrf_cli.bridge.memory import Memory
+from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.main import cli
 
 
@@ -85,6 +89,12 @@ def course(scene: Path, size: int, box=None) -> Benchmark:
 def frame_times(held: Benchmark, bundles: Sequence[Path]) -> list[float]:
     """Median ms of a frame of the scene as composed and of each bundle, all taking turns."""
     return held.frame_times(bundles, lambda done: None)
+
+
+def median_frame(field, camera: Camera, origin: np.ndarray, frames: int) -> float:
+    """The median seconds of so many frames, after one that loads kernels."""
+    took = [frame_seconds(field, camera, origin) for _ in range(1 + frames)]
+    return statistics.median(took[1:])
 
 
 def peak_of(scene: Path, size: int) -> int:

@@ -47,14 +47,14 @@ class Options(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Arrays(NamedTuple):
-    """What the functions read beside `params`."""
+    """What the functions read beside `params`, of L levels."""
 
-    starts: object  # (LEVELS,) int64, where the rows of a level begin
-    scales: object  # (LEVELS,) float64, s
-    offsets: object  # (LEVELS,) float64, o
-    sides: object  # (LEVELS,) int64
-    rows: object  # (LEVELS,) int64, of a level
-    hashed: object  # (LEVELS,) bool
+    starts: object  # (L,) int64, where the rows of a level begin
+    scales: object  # (L,) float64, s
+    offsets: object  # (L,) float64, o
+    sides: object  # (L,) int64
+    rows: object  # (L,) int64, of a level
+    hashed: object  # (L,) bool
     used: object  # int64, how many of the levels are not left out
 
 
@@ -77,7 +77,7 @@ def used_of(resolution: tuple[int, int, int], levels: list[dict], grows: bool) -
 
 def sizes(features: int, levels: list[dict], grows: bool = False) -> dict[str, int]:
     """See encodings."""
-    return {"LEVELS": len(levels), "FEATURES": features, "WIDTH": -(-len(levels) * features // 8) * 8}
+    return {"FEATURES": features, "WIDTH": -(-len(levels) * features // 8) * 8}
 
 
 def sections(

@@ -56,6 +56,16 @@ class Slot:
         ]
 
 
+def check_counts(shape: object, limits: dict[str, tuple[int, int, int]]) -> None:
+    """Refuse a shape that the kernels were not written for: raise ValueError where a number, by its name, is
+    no whole one from the first to the second limit, or no multiple of the third."""
+    for name, (low, high, each) in limits.items():
+        count = getattr(shape, name)
+        if type(count) is not int or not low <= count <= high or count % each:
+            wanted = "whole number" if each == 1 else f"multiple of {each}"
+            raise ValueError(f"'{name}' should be a {wanted} from {low} to {high}, found {count!r}")
+
+
 class HarmonicShape:
     """What the shapes of kinds have in common whose colours are spherical harmonics."""
 
@@ -84,10 +94,7 @@ class RankedShape(HarmonicShape):
 
     def __post_init__(self):
         """Refuse what the kernels were not written for: runs of eight components, and HarmonicShape's."""
-        for name in ("density_rank", "colour_rank"):
-            rank = getattr(self, name)
-            if type(rank) is not int or not 8 <= rank <= MAX_RANK or rank % 8:
-                raise ValueError(f"'{name}' should be a multiple of 8 up to {MAX_RANK}, found {rank}")
+        check_counts(self, dict.fromkeys(("density_rank", "colour_rank"), (8, MAX_RANK, 8)))
         super().__post_init__()
 
 

@@ -78,5 +78,5 @@ def test_learning_begins_with_few_texels_and_all_numbers(kind):
     [{"levels": 0}, {"levels": True}, {"features": 17}, {"finest": 8}, {"log2_rows": 30}, {"hidden": 12}],
 )
 def test_a_shape_that_no_loop_was_written_for_is_refused(wrong):
-    with pytest.raises(ValueError, match=f"'{next(iter(wrong))}' should be a whole number"):
+    with pytest.raises(ValueError, match=f"'{next(iter(wrong))}' should be a .* from"):
         HASH.field.shape_type(**wrong)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from fusedrf_cli.engine.decoders import density_sum, sh_mlp
 from fusedrf_cli.engine.encodings import grid
-from fusedrf_cli.engine.fields.assembled import Slot
+from fusedrf_cli.engine.fields.assembled import Slot, check_counts
 from fusedrf_cli.engine.kinds.dense.field import DenseConfig, DenseField
 from fusedrf_cli.engine.settings import current
 
@@ -33,10 +33,7 @@ class DenseMLPShape:
 
     def __post_init__(self):
         """Refuse what the kernels were not written for: runs of eight numbers."""
-        for name, most in (("width", 64), ("hidden", 128)):
-            count = getattr(self, name)
-            if type(count) is not int or not 8 <= count <= most or count % 8:
-                raise ValueError(f"'{name}' should be a multiple of 8 up to {most}, found {count}")
+        check_counts(self, {"width": (8, 64, 8), "hidden": (8, 128, 8)})
 
 
 class DenseMLPField(DenseField):

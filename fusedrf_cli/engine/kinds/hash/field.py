@@ -8,7 +8,7 @@ import numpy as np
 
 from fusedrf_cli.engine.decoders import density_linear, sh_mlp
 from fusedrf_cli.engine.encodings import hash_grid, trunk_features
-from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
+from fusedrf_cli.engine.fields.assembled import AssembledField, Slot, check_counts
 from fusedrf_cli.engine.settings import current
 
 BASE = 16  # vertices along an axis of the coarsest level
@@ -36,13 +36,11 @@ class HashShape:
 
     def __post_init__(self):
         """Refuse what the kernels were not written for."""
-        limits = {"levels": (1, 32), "features": (1, 16), "finest": (BASE, 1 << 18), "log2_rows": (3, 24),
-                  "hidden": (8, 256)}  # fmt: skip
-        for name, (low, high) in limits.items():
-            count = getattr(self, name)
-            whole = type(count) is int and low <= count <= high
-            if not whole or (name == "hidden" and count % 8):
-                raise ValueError(f"'{name}' should be a whole number from {low} to {high}, found {count!r}")
+        check_counts(
+            self,
+            {"levels": (1, 32, 1), "features": (1, 16, 1), "finest": (BASE, 1 << 18, 1),
+             "log2_rows": (3, 24, 1), "hidden": (8, 256, 8)},
+        )  # fmt: skip
 
     @property
     def grids(self) -> list[dict]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from fusedrf_cli.engine.decoders import sh_mlp, trunk
 from fusedrf_cli.engine.encodings import frequencies, trunk_features
-from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
+from fusedrf_cli.engine.fields.assembled import AssembledField, Slot, check_counts
 from fusedrf_cli.engine.settings import current
 
 
@@ -30,13 +30,11 @@ class MLPShape:
 
     def __post_init__(self):
         """Refuse what the kernels were not written for."""
-        limits = {"count": (1, 24), "hidden": (8, 512), "layers": (1, 16), "skip": (0, self.layers - 1),
-                  "colour": (8, 256)}  # fmt: skip
-        for name, (low, high) in limits.items():
-            value = getattr(self, name)
-            whole = type(value) is int and low <= value <= high
-            if not whole or (name in ("hidden", "colour") and value % 8):
-                raise ValueError(f"'{name}' should be a whole number from {low} to {high}, found {value!r}")
+        check_counts(
+            self,
+            {"count": (1, 24, 1), "hidden": (8, 512, 8), "layers": (1, 16, 1), "colour": (8, 256, 8)},
+        )
+        check_counts(self, {"skip": (0, self.layers - 1, 1)})
 
 
 class MLPField(AssembledField):
