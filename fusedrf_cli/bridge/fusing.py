@@ -61,11 +61,31 @@ Load = Callable[[FuseRequest, Memory, str, object], LoadedScene]
 """What is to be fused, within a memory, on a device, with a progress that is told of what goes on."""
 
 
+class NodesTooLarge(UsageProblem):
+    """No way to keep the sources as nodes fits the size that is allowed."""
+
+    def __init__(self, size: str, kind: str):
+        """size: what they take at their coarsest; kind: of one field that may be learnt instead."""
+        super().__init__(f"as nodes the sources take {size} at their coarsest")
+        self.kind = kind
+
+
 def fuse(
     request: FuseRequest, progress, load: Load = load_to_fuse, somewhere: Callable = written_somewhere
 ) -> dict:
     """Turn a composed scene into a bundle of it, of one field or of a field for each source, with the scene's
-    history; `somewhere` writes, as `written_somewhere` does."""
+    history; `somewhere` writes, as `written_somewhere` does. Where `auto` would keep the sources as nodes and
+    these do not fit, one field is learnt."""
+    try:
+        return fuse_as(request, progress, load, somewhere)
+    except NodesTooLarge as error:
+        progress.warn(f"{error}, more than --max-size: one field of the kind {error.kind} is learnt instead")
+        report = fuse_as(replace(request, kind=error.kind), progress, load, somewhere)
+        return report | {"kind_because": str(error)}
+
+
+def fuse_as(request: FuseRequest, progress, load: Load, somewhere: Callable) -> dict:
+    """`fuse` by the kind that suits the scene. Raises NodesTooLarge."""
     started = time.monotonic()
     with engine(request.device, request.threads, progress) as device:
         progress.phase("reading", None)
@@ -172,12 +192,12 @@ def best_of(
         maker, choosing, seconds = begin(builder, scene, request, device, progress, together, background)
         kept = search(maker, choosing, builder, request, saved, seconds)
     except TooSmall as error:
-        instead = (
-            ", or a --kind that learns one field" if request.kind == registry.AUTO and not kind.field else ""
-        )
+        size = readable_size(error.smallest)
+        if request.kind == registry.AUTO and kind.field is None:
+            raise NodesTooLarge(size, best_suited(composed, learnt=True)[0].name) from error
         raise UsageProblem(
-            f"--max-size is too small: the file takes {readable_size(error.smallest)} at its coarsest, "
-            f"where {readable_size(builder_request.limit)} were allowed; give more{instead}"
+            f"--max-size is too small: the file takes {size} at its coarsest, "
+            f"where {readable_size(builder_request.limit)} were allowed; give more"
         ) from error
     return Candidate(kept, builder, lambda: figures_of(kept, maker, choosing, seconds), background)
 
@@ -243,9 +263,9 @@ def choose_kind(name: str, loaded: LoadedScene, composed: ComposedField) -> tupl
     return kind, suits.why
 
 
-def best_suited(composed: ComposedField) -> tuple[Kind, str]:
-    """The kind that suits a scene best, and why."""
-    suited = [(kind.suits(composed), kind) for kind in registry.kinds()]
+def best_suited(composed: ComposedField, learnt: bool = False) -> tuple[Kind, str]:
+    """The kind that suits a scene best, and why; `learnt`: of those that make one field of it."""
+    suited = [(k.suits(composed), k) for k in registry.kinds() if k.field is not None or not learnt]
     suits, kind = max((pair for pair in suited if pair[0].score is not None), key=lambda pair: pair[0].score)
     return kind, suits.why
 

@@ -16,7 +16,9 @@ from fusedrf_cli.engine.decoders import activations
 from fusedrf_cli.engine.decoders.activations import activated, activated_slope
 from fusedrf_cli.engine.fields.box import ParameterBlock
 from fusedrf_cli.engine.fields.part_options import Activation, Layers, Limits, Width
+from fusedrf_cli.engine.kernels.lanes import LANES, network_lanes
 from fusedrf_cli.engine.kernels.networks import network, network_backward
+from fusedrf_cli.engine.kernels.primitives import LINE
 
 
 class Options(msgspec.Struct, forbid_unknown_fields=True):
@@ -46,13 +48,17 @@ def sizes(
     width: int, hidden: int, outputs: int, layers: int = 1, skip: int = 0, **activation
 ) -> dict[str, int | float]:
     """See decoders; scratch holds features, what the layers made, outputs, and the gradients of features, of
-    two layers and of the outputs, these 0 between samples. skip 0: none."""
+    two layers and of the outputs, these 0 between samples. skip 0: none. From LANE_AT on it holds how many
+    lanes are in use, where they are, their features, two layers and outputs (kernels/lanes.py)."""
     rooms = {
         "X": width, "H": layers * hidden, "OUT": outputs, "D_H": hidden, "D_BEFORE": hidden,
         "D_OUT": outputs, "D_X": width * (2 if skip else 1),
     }  # fmt: skip
-    starts = np.cumsum([0, *rooms.values()]).tolist()
+    lanes = {"LANE_KEY": LINE, "LANE_X": 6 * LANES, "LANE_H": width * LANES, "LANE_OUT": 2 * hidden * LANES}
+    starts, lane_starts = (np.cumsum([0, *counts.values()]).tolist() for counts in (rooms, lanes))
     return {
+        **dict(zip(lanes, lane_starts[1:], strict=True)), "LANES": LANES,
+        "LANE_ROOM": lane_starts[-1] + outputs * LANES,
         "WIDTH": width, "HIDDEN": hidden, "OUTPUTS": outputs, "LAYERS": layers, "SKIP": skip,
         **dict(zip(rooms, starts, strict=False)), "ROOM": starts[-1], **activations.sizes(**activation),
     }  # fmt: skip
@@ -116,6 +122,15 @@ def outputs_at(field, cell, scratch):
     return out
 
 
+def hand_on(field, unit, cell, scratch):
+    """Leave all outputs at a point where `kept_at` says: those of a lane, if one knows them."""
+    lane = lane_of(unit, scratch)
+    if lane >= 0:
+        of_lane(field, lane, scratch)
+    else:
+        outputs_at(field, cell, scratch)
+
+
 def kept_at():
     """Where `outputs_at` has left them."""
     return np.uint64(AT + OUT)
@@ -128,7 +143,62 @@ def pending_at(scratch):
 
 def forward(field, cell, scratch):
     """See decoders."""
-    f = scratch[outputs_at(field, cell, scratch)]
+    outputs_at(field, cell, scratch)
+    return density_of(field, scratch)
+
+
+def key_of(u, scratch):
+    """A coordinate as two numbers of scratch's type, which tell neighbours of float64 apart."""
+    high = scratch.dtype.type(u)
+    return high, scratch.dtype.type(u - high)
+
+
+def lane_of(unit, scratch):
+    """The lane of these coordinates, or -1."""
+    if scratch.shape[0] <= LANE_AT:
+        return -1
+    u, v, w = key_of(unit[0], scratch), key_of(unit[1], scratch), key_of(unit[2], scratch)
+    for lane in range(np.uint64(scratch[LANE_AT])):
+        at = np.uint64(LANE_AT + LANE_KEY) + np.uint64(6) * lane
+        if scratch[at] == u[0] and scratch[at + np.uint64(2)] == v[0] and scratch[at + np.uint64(4)] == w[0]:
+            if scratch[at + np.uint64(1)] == u[1] and scratch[at + np.uint64(3)] == v[1]:
+                if scratch[at + np.uint64(5)] == w[1]:
+                    return np.int64(lane)
+    return -1
+
+
+def enter_lane(field, cell, unit, lane, scratch):
+    """The features of a cell into a lane."""
+    features_forward(field, cell, scratch, scratch, AT + X)
+    at, to = np.uint64(LANE_AT + LANE_KEY + 6 * lane), np.uint64(LANE_AT + LANE_X + lane)
+    scratch[at], scratch[at + np.uint64(1)] = key_of(unit[0], scratch)
+    scratch[at + np.uint64(2)], scratch[at + np.uint64(3)] = key_of(unit[1], scratch)
+    scratch[at + np.uint64(4)], scratch[at + np.uint64(5)] = key_of(unit[2], scratch)
+    for r in range(np.uint64(WIDTH)):
+        scratch[to + r * np.uint64(LANES)] = scratch[np.uint64(AT + X) + r]
+
+
+def fill_lanes(field, count, scratch):
+    """The outputs in all lanes, of which so many are in use."""
+    scratch[LANE_AT] = count
+    if count > 0:
+        network_lanes(
+            WIDTH, HIDDEN, LAYERS, SKIP, OUTPUTS, field.params, field.layers, scratch,
+            np.uint64(LANE_AT + LANE_X), np.uint64(LANE_AT + LANE_H), np.uint64(LANE_AT + LANE_OUT),
+        )  # fmt: skip
+
+
+def of_lane(field, lane, scratch):
+    """`forward` by what is in a lane, whose outputs are handed on."""
+    out, at = kept_at(), np.uint64(LANE_AT + LANE_OUT + lane)
+    for r in range(np.uint64(OUTPUTS)):
+        scratch[out + r] = scratch[at + r * np.uint64(LANES)]
+    return density_of(field, scratch)
+
+
+def density_of(field, scratch):
+    """σ, and what `backward` needs of it, by the outputs that are kept."""
+    f = scratch[kept_at()]
     return float(field.activation[0] * activated(f + field.activation[1])), float(f)
 
 

@@ -50,9 +50,11 @@ def forward(field, unit, scratch, out, base):
         u = unit[0] if axis == 0 else (unit[1] if axis == 1 else unit[2])
         x = field.lo[axis] + u * field.side[axis] if FRAME else 2.0 * u - 1.0
         out[base + axis] = x
+        sin, cos = math.sin(x), math.cos(x)
         for level in range(COUNT):
-            out[base + 3 + 6 * level + axis] = math.sin(x * (1 << level))
-            out[base + 6 + 6 * level + axis] = math.cos(x * (1 << level))
+            out[base + 3 + 6 * level + axis] = sin
+            out[base + 6 + 6 * level + axis] = cos
+            sin, cos = 2 * sin * cos, 1 - 2 * sin * sin  # of twice the angle, in float64
     for r in range(NUMBERS, WIDTH):
         out[base + r] = 0
 

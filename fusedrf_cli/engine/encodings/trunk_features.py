@@ -25,7 +25,7 @@ def bound(sections: dict, read: torch.Tensor, outputs: int) -> torch.Tensor:
 
 
 locate = None  # the cell of the density's encoding serves
-READS_SCRATCH = True  # kernels/assembled.py: it is told whether `outputs_at` has just been asked for
+READS_SCRATCH = True  # kernels/assembled.py: it is told whether sigma has just handed them on
 
 
 # -- compiled ------------------------------------------------------------------------------------------------
@@ -33,8 +33,9 @@ READS_SCRATCH = True  # kernels/assembled.py: it is told whether `outputs_at` ha
 
 def forward(field, cell, scratch, out, base):
     """See encodings."""
-    start = np.uint64(base)
-    source = features_kept_at() if cell[2] == 1 else features_outputs_at(field, cell[1], scratch)
+    start, source = np.uint64(base), features_kept_at()
+    if cell[2] == 0:
+        features_hand_on(field, cell[0], cell[1], scratch)
     for r in range(np.uint64(WIDTH)):
         out[start + r] = scratch[source + r]
 

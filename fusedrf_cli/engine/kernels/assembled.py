@@ -65,9 +65,44 @@ def separate_cell(field, cell):
     return colour_locate(field, cell[0])
 
 
+def looked_density(field, grid, index, p, d, scratch):
+    """`density` where the samples ahead were asked for together (ahead.py)."""
+    unit = unit_of(field, p)
+    cell = density_locate(field, unit)
+    strides = density_steps_at(field, cell, unit, index)
+    if strides == 0:
+        return 0.0, 0.0, 0, (unit, cell)
+    lane = sigma_lane_of(unit, scratch)
+    sigma, pre = sigma_of_lane(field, lane, scratch) if lane >= 0 else sigma_forward(field, cell, scratch)
+    return sigma, pre, strides, (unit, density_located(field, cell, scratch))
+
+
+def lane_of(field, p, scratch):
+    """See ahead.py."""
+    return sigma_lane_of(unit_of(field, p), scratch)
+
+
+def enter_lane(field, grid, p, lane, scratch):
+    """See ahead.py."""
+    unit = unit_of(field, p)
+    cell = density_locate(field, unit)
+    if density_steps_at(field, cell, unit, 0) == 0:
+        return lane
+    sigma_enter_lane(field, cell, unit, lane, scratch)
+    return lane + 1
+
+
+def fill_lanes(field, count, scratch):
+    """See ahead.py."""
+    sigma_fill_lanes(field, count, scratch)
+
+
+LOOKING = lane_of, enter_lane, fill_lanes
+
+
 def kept_density(field, grid, index, p, d, scratch):
     """`density` with a cell of three: 1 says that what sigma hands on of it is in scratch, where a `colour`
-    that follows at once finds it."""
+    that follows at once finds it, unless it is in a lane."""
     sigma, pre, strides, cell = plain_density(field, grid, index, p, d, scratch)
     return sigma, pre, strides, (cell[0], cell[1], 1)
 
@@ -230,6 +265,7 @@ def no_ray_backward(field, d, scratch, grad):
 HOOKS = {
     "locate": locate, "steps_at": steps_at, "located": located, "is_inside": None, "pack_cell": None,
     "unpack_cell": None, "next_index": None, "forward": None, "backward": None, "summed": None,
+    "lane_of": None, "enter_lane": None, "fill_lanes": None, "of_lane": None, "hand_on": None,
     "summed_backward": None, "logits": None, "logits_backward": logits_backward, "prefetch_at": None,
     "point_setup": no_point_setup, "ray_setup": no_ray_setup, "ray_backward": no_ray_backward,
 }  # fmt: skip
@@ -255,6 +291,8 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
                 raise ValueError(f"'{name}' of '{module.__name__}' has two meanings")
     templates = {template.__name__: template for template in TEMPLATES}
     templates |= {name: template for name, (template, hook) in OPTIONAL.items() if hook in names}
+    if hasattr(sigma, "fill_lanes") and "density_next_index" not in names:
+        templates |= {"density": looked_density} | {template.__name__: template for template in LOOKING}
     shared = colour is density or getattr(colour, "locate", locate) is None
     templates["colour_cell"] = shared_cell if shared else separate_cell
     if getattr(colour, "READS_SCRATCH", False):
@@ -335,11 +373,12 @@ def constants(field) -> dict[str, int | float]:
     """The constants of a field's namespace by name: those of each slot (engine/fields/assembled.py) with its
     prefix, and AT, where its ROOM numbers of scratch begin, on a cache line."""
     named, start = {}, 0
-    of_loops = "KEPT", "LEARN_FROM", "SHADING_COST"  # which loops.py reads
+    of_loops = "KEPT", "LEARN_FROM", "SHADING_COST", "LANES", "LANE_ROOM"  # which loops read
     for slot, filled in field.slots.items():
         slot_sizes = filled.sizes
         named |= {name if name in of_loops else f"{slot}_{name}": value for name, value in slot_sizes.items()}
         named[f"{slot}_AT"] = start
         start += -(-slot_sizes.get("ROOM", 0) // LINE) * LINE
     shown_by = COLOURS.index(field.colour_activation)
+    named |= {f"{slot}_LANE_AT": start for slot in field.slots}
     return {"KEPT": 0, **named, "COLOUR_ACTIVATION": shown_by, "SCRATCH": start}

@@ -245,7 +245,8 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
         index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, index)
         while index >= 0 and trans > slots.early_stop:
             t_local = t_begin + 0.5 * midpoint(index, n_steps) * step
-            p = position_at(origin, direction, t_local)
+            p, line = position_at(origin, direction, t_local), (origin, direction, warp)
+            look_along(field, grid, line, t_begin, t_end, step, index, n_steps, scratch)
             sigma, _, strides, cell = density(field, grid, index, p, d, scratch)
             if strides > 0:
                 tau = thick * sigma * optical_length(warp, p, d, t_local, n_steps, strides, step)
@@ -292,7 +293,8 @@ def trace_ray(field, grid, slots, i, scratch, memory, out):
         index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, index)
         while index >= 0 and trans > slots.early_stop and count < MAX_TRACED:
             t_local = t_begin + 0.5 * midpoint(index, n_steps) * step
-            p = position_at(origin, direction, t_local)
+            p, line = position_at(origin, direction, t_local), (origin, direction, warp)
+            look_along(field, grid, line, t_begin, t_end, step, index, n_steps, scratch)
             sigma, _, strides, cell = density(field, grid, index, p, d, scratch)
             if strides > 0 and sigma > 0.0:
                 depth = thick * sigma * optical_length(warp, p, d, t_local, n_steps, strides, step)
@@ -344,12 +346,18 @@ def shade_ray(field, grid, slots, i, scratch, memory, out):
 # -- points --------------------------------------------------------------------------------------------------
 
 
+def chosen_point(query, i):
+    """Point chosen[i] in the instance's space."""
+    where, b = query.world_to_instance, query.instance
+    return point(ray_in_instance(where, b, query.points, query.dirs, query.chosen[i])[0])
+
+
 def point_in_instance(field, grid, query, i):
     """Point chosen[i] in the instance's space, the unit direction there, and what densities there are times
     in the scene's frame; asks for the numbers that a later point will read."""
     matrix, b, n = query.world_to_instance, query.instance, i + POINTS_AHEAD
     if n < query.chosen.shape[0]:
-        p = point(ray_in_instance(matrix, b, query.points, query.dirs, query.chosen[n])[0])
+        p = chosen_point(query, n)
         if is_inside(field, grid, p):
             prefetch_density(field, field.params, 0, p)
             if query.with_colour:
@@ -364,6 +372,7 @@ def densest_at(field, grid, query, i, scratch, memory, out):
     j = query.chosen[i]
     p, d, times = point_in_instance(field, grid, query, i)
     if is_inside(field, grid, p) and not is_cropped_away(query, j):
+        look_in_instance(field, grid, query, i, scratch)
         sigma, _, strides, cell = density(field, grid, 0, p, d, scratch)
         sigma *= times
         if strides > 0 and query.adds:
@@ -380,11 +389,13 @@ def colour_at(field, grid, query, i, scratch, memory, out):
     if query.adds:
         if not is_inside(field, grid, p) or is_cropped_away(query, j):
             return
+        look_in_instance(field, grid, query, i, scratch)
         sigma, _, strides, cell = density(field, grid, 0, p, d, scratch)
         if strides == 0 or sigma <= 0.0:
             return
         share = sigma * times / out.sigma[j]
     else:
+        look_in_instance(field, grid, query, i, scratch)
         cell = unpack_cell(field, out.cell[j], p)
     ray_setup(field, d, scratch)
     c_r, c_g, c_b = colour(field, cell, p, d, scratch, memory, 0)

@@ -66,6 +66,7 @@ def query_point_backward(field, grid, gradients, i, samples, scratch, grad, loss
             prefetch_colour(field, field.params, 0, q)
             prefetch_colour(field, grad, 0, q)
     if is_inside(field, grid, p):
+        look_among(field, grid, gradients.points, i, scratch)
         sigma, pre, strides, cell = density(field, grid, 0, p, d, scratch)
         if strides > 0 and sigma > 0:
             shaded = d_rgb[0] != 0 or d_rgb[1] != 0 or d_rgb[2] != 0
@@ -132,8 +133,10 @@ def train_ray(field, grid, batch, i, samples, scratch, grad, loss):
             t_local = t_begin + 0.5 * midpoint(index, n_steps) * step
             following, wide = next_sample(grid, origin, direction, t_begin, t_end, step, index + n_steps)
             prefetch_sample(field, packed, origin, direction, t_begin, step, following, wide)
+            line = origin, direction, warp
+            look_along(field, grid, line, t_begin, t_end, step, index, n_steps, scratch)
             p, opacity, pre, strides, cell = alpha_at(
-                field, grid, (origin, direction, warp), index, n_steps, t_local, step, d, scratch
+                field, grid, line, index, n_steps, t_local, step, d, scratch
             )
             if strides > 0:
                 packed = pack_cell(cell)

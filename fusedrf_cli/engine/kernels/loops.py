@@ -182,6 +182,7 @@ def query_point(field, grid, query, i, scratch, memory, out):
     out.sigma[i] = 0
     out.rgb[i, 0], out.rgb[i, 1], out.rgb[i, 2] = 0, 0, 0
     if is_inside(field, grid, p):
+        look_among(field, grid, query.points, i, scratch)
         sigma, _, strides, cell = density(field, grid, 0, p, d, scratch)
         if strides > 0:
             out.sigma[i] = rate(p, d) * sigma
@@ -203,8 +204,10 @@ def weigh_ray(field, grid, rays, i, samples, scratch, most, loss):
         index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, 0)
         while index >= 0 and trans > rays.early_stop:
             t_local = t_begin + 0.5 * midpoint(index, n_steps) * step
+            line = origin, direction, warp
+            look_along(field, grid, line, t_begin, t_end, step, index, n_steps, scratch)
             p, opacity, _, strides, cell = alpha_at(
-                field, grid, (origin, direction, warp), index, n_steps, t_local, step, d, scratch
+                field, grid, line, index, n_steps, t_local, step, d, scratch
             )
             if strides > 0:
                 weight = trans * opacity
@@ -232,8 +235,10 @@ def vote_ray(field, grid, rays, i, samples, scratch, votes, loss):
         index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, 0)
         while index >= 0 and trans > rays.early_stop:
             t_local = t_begin + 0.5 * midpoint(index, n_steps) * step
+            line = origin, direction, warp
+            look_along(field, grid, line, t_begin, t_end, step, index, n_steps, scratch)
             p, opacity, _, strides, cell = alpha_at(
-                field, grid, (origin, direction, warp), index, n_steps, t_local, step, d, scratch
+                field, grid, line, index, n_steps, t_local, step, d, scratch
             )
             if strides > 0:
                 weight = trans * opacity
@@ -249,15 +254,23 @@ def vote_ray(field, grid, rays, i, samples, scratch, votes, loss):
             index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, index)
 
 
+def point_of_cell(cells, i, q):
+    """Where in cell i offset q is."""
+    return (
+        cells.lo[0] + (cells.cells[i, 0] + cells.offsets[q, 0]) * cells.cell[0],
+        cells.lo[1] + (cells.cells[i, 1] + cells.offsets[q, 1]) * cells.cell[1],
+        cells.lo[2] + (cells.cells[i, 2] + cells.offsets[q, 2]) * cells.cell[2],
+    )
+
+
 def peak_of_cell(field, grid, cells, i, scratch, memory, out):
     """Largest σ, per length of the coordinates, over `offsets` in cell i."""
     best = 0.0
     for q in range(cells.offsets.shape[0]):
-        x = cells.lo[0] + (cells.cells[i, 0] + cells.offsets[q, 0]) * cells.cell[0]
-        y = cells.lo[1] + (cells.cells[i, 1] + cells.offsets[q, 1]) * cells.cell[1]
-        z = cells.lo[2] + (cells.cells[i, 2] + cells.offsets[q, 2]) * cells.cell[2]
-        sigma = density(field, grid, 0, (x, y, z), (0.0, 0.0, 1.0), scratch)[0]
-        best = max(best, depth_per_coordinate((x, y, z)) * sigma)
+        p = point_of_cell(cells, i, q)
+        look_into_cell(field, grid, cells, i, q, scratch)
+        sigma = density(field, grid, 0, p, (0.0, 0.0, 1.0), scratch)[0]
+        best = max(best, depth_per_coordinate(p) * sigma)
     out[i] = best
 
 
@@ -282,7 +295,7 @@ def each(field, grid, query, count, per_task, threads, out):
     for turn in prange(each_has * threads):
         part = turn % each_has * threads + turn // each_has
         real = field.params.dtype
-        scratch, memory = np.zeros(SCRATCH, real), np.empty(max(KEPT, 1), real)
+        scratch, memory = np.zeros(SCRATCH + LANE_ROOM, real), np.empty(max(KEPT, 1), real)
         low, high = part * per_task, min(count, (part + 1) * per_task)
         each_task(field, grid, query, low, high, scratch, memory, out)
 
@@ -305,7 +318,9 @@ def sweep(field, grid, batch, count, most, grads, loss):
             reals[2], reals[3], reals[4], np.empty((most, 3)), np.empty(max(most * KEPT, 1), real),
         )  # fmt: skip
         low, high = p * count // n_rows, (p + 1) * count // n_rows
-        sweep_task(field, grid, batch, low, high, samples, np.zeros(SCRATCH, real), grads[p], loss[p])
+        sweep_task(
+            field, grid, batch, low, high, samples, np.zeros(SCRATCH + LANE_ROOM, real), grads[p], loss[p]
+        )
 
 
 # -- marching, which needs no field --------------------------------------------------------------------------

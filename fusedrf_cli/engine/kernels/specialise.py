@@ -16,7 +16,7 @@ from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from numba import get_num_threads, njit
 from numba.core.dispatcher import Dispatcher
 
-from fusedrf_cli.engine.kernels import instances, learning, light, loops, primitives
+from fusedrf_cli.engine.kernels import ahead, instances, learning, light, loops, primitives
 from fusedrf_cli.engine.kernels.field_free import FLAGS, loop, serial
 
 ROLES = {"each": loop, "sweep": loop, "march": loop, "each_task": serial, "sweep_task": serial}
@@ -89,7 +89,7 @@ def compile_into(names: dict, functions: dict[str, FunctionType], roles: dict = 
 def namespace(device_module: ModuleType | None, space: ModuleType) -> tuple[dict, dict[str, FunctionType]]:
     """What the names mean before anything is compiled, and which of them are plain functions to compile."""
     own = [device_module] if device_module else []
-    modules = [loops, learning, instances, light, *bases_of(space), space, *own]
+    modules = [loops, ahead, learning, instances, light, *bases_of(space), space, *own]
     names = {name: value for module in (primitives, *modules) for name, value in vars(module).items()}
     module_names = {module.__name__ for module in modules}
     functions = {

@@ -51,6 +51,20 @@ def test_what_is_made_of_a_scene_is_upright_as_the_scene_is(tmp_path):
         assert OpenBundle(tmp_path / f"{made}.rfpack").scene.up == (0.0, -1.0, 0.0)
 
 
+def test_one_field_is_learnt_of_what_does_not_fit_as_it_is(tmp_path):
+    """An import is not made coarser, so that as a node it takes what it takes."""
+    centres = np.random.default_rng(0).uniform(-1, 1, (20_000, 3))
+    bundle, fused = tmp_path / "balls.rfpack", tmp_path / "fused.rfpack"
+    verbs.import_field(splat_file(tmp_path / "balls.splat", centres), bundle)
+    report = verbs.fuse(bundle, fused, max_size=300_000, time_budget=2)
+    assert report["kind"] == "vm" and report["bytes"] <= 300_000
+    assert "as nodes the sources take" in report["kind_because"]
+    assert any("one field of the kind vm is learnt instead" in warning for warning in report["warnings"])
+    with pytest.raises(UsageProblem, match="--max-size is too small"):
+        verbs.fuse(bundle, tmp_path / "none.rfpack", max_size=2_000)
+    assert not (tmp_path / "none.rfpack").exists()
+
+
 def test_what_lies_far_away_becomes_a_field_of_its_own(tmp_path):
     rng = np.random.default_rng(1)
     centres = np.concatenate([rng.uniform(-1, 1, (400, 3)), rng.uniform(-300, 300, (3, 3))])

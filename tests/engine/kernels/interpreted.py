@@ -21,6 +21,7 @@ def interpreted(field) -> dict[str, Callable]:
         function = getattr(value, "py_func", functions.get(name))
         if function is not None:
             names[name] = FunctionType(function.__code__, names, name, function.__defaults__)
+    names["LANES"] = 0  # each sample by itself
     names["literally"], names["prefetch"] = lambda value: value, lambda array, index: array[index]
     return names
 

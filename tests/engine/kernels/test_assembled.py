@@ -37,8 +37,8 @@ from fusedrf_cli.engine.encodings import (
 )
 from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
-from fusedrf_cli.engine.kernels import instances, learning, light, loops, primitives, specialise
-from fusedrf_cli.engine.kernels.assembled import OPTIONAL, READS, TEMPLATES, assemble
+from fusedrf_cli.engine.kernels import ahead, instances, learning, light, loops, primitives, specialise
+from fusedrf_cli.engine.kernels.assembled import LOOKING, OPTIONAL, READS, TEMPLATES, assemble
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
 from ..conftest import BOX, points_in
@@ -294,8 +294,9 @@ def test_no_two_parts_of_a_namespace_define_one_name(field, space):
     own = {name for name in {*device_module, *field.device_module.sizes(field)} if not name.startswith("__")}
     hooks = {template.__name__ for template in TEMPLATES} | set(OPTIONAL)
     settings = {"LEARN_FROM", "SHADING_COST"}
-    for module in (loops, learning, space, primitives, instances, light):
-        allowed = {loops: hooks | settings, space: settings}.get(module, set())
+    for module in (loops, ahead, learning, space, primitives, instances, light):
+        looking = {template.__name__ for template in LOOKING} | {"LANES", "LANE_ROOM"}
+        allowed = {loops: hooks | settings, space: settings, ahead: looking}.get(module, set())
         others = {
             name for name in own & set(vars(module)) if device_module.get(name) is not vars(module)[name]
         }
@@ -306,7 +307,7 @@ def test_names_get_the_prefix_of_their_slot(field):
     names, functions = specialise.namespace(field.device_module, bounded)
     for slot in READS:
         assert {f"{slot}_forward", f"{slot}_summed"} & set(names)
-    assert "sigma_activation" in functions["sigma_forward"].__code__.co_names
+    assert "sigma_activation" in functions["sigma_backward"].__code__.co_names
     for name, function in functions.items():
         assert not [used for used in function.__code__.co_names if used.startswith("features_")], name
 

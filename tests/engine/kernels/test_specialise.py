@@ -9,7 +9,7 @@ import pytest
 
 from fusedrf_cli.engine.decoders import density_sum, sh, sh_basis
 from fusedrf_cli.engine.encodings import bricks, line, plane_line
-from fusedrf_cli.engine.kernels import instances, learning, light, loops, primitives, specialise
+from fusedrf_cli.engine.kernels import ahead, instances, learning, light, loops, primitives, specialise
 from fusedrf_cli.engine.kernels.assembled import assemble
 from fusedrf_cli.engine.spaces import SPACES, bounded, unbounded
 from tests.engine.kinds.cases import KINDS
@@ -188,7 +188,8 @@ def test_every_loop_carries_the_name_of_its_item():
 HOOKS = {
     "ray_setup", "ray_backward", "pack_cell", "unpack_cell", "next_index", "is_inside", "prefetch_density",
     "prefetch_colour", "COLOUR_FROM", "LEARN_FROM", "SHARED_COLOUR_FROM", "REST_FROM", "SHADING_COST",
-    "next_sample", "next_change", "optical_length",
+    "next_sample", "next_change", "optical_length", "lane_of", "enter_lane", "fill_lanes", "LANES",
+    "LANE_ROOM",
 }  # fmt: skip
 """What a kind or a space may have in place of the loops' own, see loops.py."""
 
@@ -198,7 +199,7 @@ HOOKS = {
 def test_no_name_means_two_things_in_a_namespace(name, space):
     """It is flat, and the later name wins: a template's constant would be a kind's offset in scratch."""
     field = KINDS[name]()
-    ours = [vars(module) for module in (primitives, loops, learning, instances, light, space)]
+    ours = [vars(module) for module in (primitives, loops, ahead, learning, instances, light, space)]
     theirs = vars(field.device_module)
     meanings: dict[str, object] = {}
     for names in (*ours, theirs, field.device_module.sizes(field)):
