@@ -1,5 +1,5 @@
-"""Networks at several samples at once, on the CPU: its vectors hold a number of LANES samples, so that weights
-are read once for all of them. The numbers of a sample are the same whatever lies in the other lanes.
+"""Networks at several samples at once, on the CPU: its vectors hold a number of LANES samples, so that
+weights are read once for all of them. The numbers of a sample are the same whatever lies in the other lanes.
 
 A number r of a sample in `lane` lies at [r LANES + lane].
 """
@@ -17,8 +17,8 @@ TILE = 8  # outputs whose sums are in registers
 
 @intrinsic(prefer_literal=False)
 def add_tile(typing, inputs, params, weights, stride, values, v, out, o):
-    """out[o + r LANES + l] += Σ_i params[weights + i stride + r] values[v + i LANES + l] for the TILE outputs r
-    and all lanes l, i < inputs, all of them uint64. Numba alone would keep the sums in memory."""
+    """out[o + r LANES + l] += Σ_i params[weights + i stride + r] values[v + i LANES + l] for the TILE outputs
+    r and all lanes l, i < inputs, all of them uint64. Numba alone would keep the sums in memory."""
 
     def generate(context, builder, signature, arguments):
         data = {

@@ -13,12 +13,16 @@ from formats.errors import FormatError
 from formats.records import FieldRecord, decode_field, encode_field
 from fusedrf_cli.bridge.field_bundle import stored
 from fusedrf_cli.bridge.sizes import BundleSizes
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.encodings import plane_line
 from fusedrf_cli.engine.encodings.hash_runs import EMPTY_FROM, HashGrid, hashed_row
 from fusedrf_cli.engine.fields.base import sampling_step
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds import field_cutting, registry
-from fusedrf_cli.engine.kinds.builder import StorageSetting
+from fusedrf_cli.engine.kinds.builder import BuildRequest, Plan, StorageSetting
+from fusedrf_cli.engine.kinds.vm.builder import VMBuilderConfig
 from fusedrf_cli.engine.kinds.vm.field import DETAIL, VMField, VMShape
 from fusedrf_cli.engine.kinds.vm.trimming import (
     queried_rows,
@@ -28,6 +32,7 @@ from fusedrf_cli.engine.kinds.vm.trimming import (
     without_unqueried,
 )
 from fusedrf_cli.engine.selection.cells import CellGrid, Selection
+from fusedrf_cli.engine.settings import using
 from fusedrf_cli.engine.spaces.bounded import STEP_PER_VOXEL
 
 from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, points_in, random_vm, unit
@@ -324,3 +329,41 @@ def test_it_learns_what_is_finer_than_texels():
         left[hashed] = error.square().mean().item()
     plain, detailed = left.values()
     assert plain > 0.2 and detailed < 0.05
+
+
+def student_of(scene: ComposedField, limit: int, **asked) -> Plan:
+    """What the largest student of a scene is planned as, in a file of so many bytes."""
+    request = BuildRequest(BundleSizes(), limit, **asked)
+    coarse = OccupancyConfig(scene_cells=16)
+    with using(VMBuilderConfig(VMShape(8, 8, 0), detail_from=80_000), coarse):
+        return registry.kind("vm").builder(scene, request).largest()
+
+
+def test_a_student_with_numbers_to_spare_has_one():
+    scene = ComposedField(
+        [Placed("one", random_vm(VMShape(8, 8, 0), (120, 90, 105), torch.float32), np.eye(4))]
+    )
+    plan = student_of(scene, 150_000)
+    hashed = plan.storage.hashed
+    assert plan.numbers <= plan.allowed and hashed.shape[0] * 4 <= 0.3 * plan.allowed
+    assert 2 * hashed.shape[0] * 4 > 0.3 * plan.allowed  # rows are a power of two
+    assert hashed.spacings[0] == 2 * hashed.spacings[1] == 4 * hashed.spacings[2]
+    assert 0.5 * plan.voxel < hashed.spacings[1] < plan.voxel
+    assert student_of(scene, 150_000, seconds=200.0).storage.hashed == hashed
+    few, hurried = student_of(scene, 70_000), student_of(scene, 150_000, seconds=60.0)
+    whole = student_of(scene, 10_000_000)
+    assert few.storage.hashed is hurried.storage.hashed is whole.storage.hashed is None
+    assert whole.voxel <= scene.voxel_size * 1.001
+
+
+def test_a_student_that_grows_keeps_what_it_says():
+    """And none of a detail, whose rows are others then."""
+    kind, small = registry.kind("vm"), random_vm(SIXTY_FOUR, hashed=HashGrid((0.5,), 64))
+    storage = StorageSetting(hashed=HashGrid((0.2, 0.1), 256))
+    plan = kind.plan_at(BOX, small.resolution, storage)
+    grown = kind.grown(small, plan)
+    assert grown.shape.hashed == storage.hashed and not grown.sections()[DETAIL].any()
+    for got, said in zip(
+        asked(grown, reference=True), asked(without_detail(small), reference=True), strict=True
+    ):
+        np.testing.assert_allclose(got, said, rtol=1e-9)

@@ -7,12 +7,14 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.encodings.hash_runs import ROW
+from fusedrf_cli.engine.encodings.hash_runs import ROW, HashGrid
 from fusedrf_cli.engine.fields.assembled import MAX_RANK
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds.box_kind import BoxKind
 from fusedrf_cli.engine.kinds.builder import (
+    BuildRequest,
     Contents,
+    DistilledBuilder,
     Plan,
     Section,
     StorageSetting,
@@ -29,6 +31,7 @@ from fusedrf_cli.engine.kinds.vm.trimming import (
     reshaped,
     smaller_shape,
     truncated,
+    with_detail,
     without_detail,
     without_unqueried,
     without_unread,
@@ -46,6 +49,14 @@ class VMBuilderConfig:
     """Times its own voxel: how coarse a field can get before it is left without its detail."""
     noise: float = 0.03
     """Of the factors of a student that takes over others' numbers."""
+    detail_from: int = 6_000_000
+    """Numbers of a student from which it has a detail."""
+    detail_seconds: float = 120.0
+    """Of learning from which it has one, where the time decides."""
+    detail_share: float = 0.3
+    """Of a student's numbers that its detail takes at most."""
+    detail_spacings: tuple[float, ...] = (2.0, 1.0, 0.5)
+    """Of the detail's levels, in the texels that the student would have without it."""
 
 
 def shape_within(storage: StorageSetting) -> VMShape:
@@ -74,6 +85,10 @@ class VMKind(BoxKind):
         """See BoxKind."""
         return replace(super().shape(storage), hashed=storage.hashed)
 
+    def builder(self, scene: ComposedField, request: BuildRequest) -> "VMStudentBuilder":
+        """See Kind."""
+        return VMStudentBuilder(self, scene, request)
+
     def suits(self, scene: ComposedField) -> Suitability:
         """It holds any scene, one that is not stretched and has its detail everywhere best."""
         return Suitability(1.0, "one vm field over the scene learns any sources by any rule")
@@ -83,6 +98,8 @@ class VMKind(BoxKind):
     ) -> VMField | None:
         """A field over the scene's box that begins as the background does, where that is a vm field, placed
         upright and scaled alike along all axes; a place as it is, where the scene lies in it."""
+        if plan.storage.hashed is not None:  # it learns no less from nothing
+            return None
         kept = self.place_of(background, plan, scene)
         if kept is not None:
             return kept
@@ -112,6 +129,11 @@ class VMKind(BoxKind):
         own = reshaped(field, shape)
         own = own.with_params(own.params.clone())
         return own.with_occupancy(OccupancyGrid(box, overlapped(cells, longest, box), cells.space))
+
+    def grown(self, before: VMField, plan: Plan) -> VMField:
+        """See Kind: a detail has other rows then, and begins anew."""
+        moved = without_detail(before).resampled(plan.box, plan.resolution)
+        return with_detail(moved, plan.storage.hashed)
 
     def widened(
         self, field: VMField, plan: Plan, scene: ComposedField, generator: torch.Generator
@@ -162,6 +184,23 @@ class VMKind(BoxKind):
         if shape.hashed:
             description["detail_rows"] = held.count if held else shape.hashed.shape[0]
         return description
+
+
+class VMStudentBuilder(DistilledBuilder):
+    """A student of planes and lines, with a detail where it has numbers to spare and coarser texels than the
+    scene: products over all of a scene cannot hold objects that have nothing in common."""
+
+    def plan(self, storage: StorageSetting, numbers: int) -> Plan:
+        """See `DistilledBuilder`."""
+        config = current(VMBuilderConfig)
+        plain = super().plan(replace(storage, hashed=None), numbers)
+        around, seconds = any(p.unbounded for p in self.scene.placed), self.request.seconds
+        hurried = seconds is not None and seconds < config.detail_seconds
+        if around or hurried or numbers < config.detail_from or plain.voxel <= self.scene.voxel_size:
+            return plain
+        spacings = tuple(plain.voxel * times for times in config.detail_spacings)
+        rows = 1 << int(np.log2(config.detail_share * numbers / (ROW * len(spacings))))
+        return super().plan(replace(storage, hashed=HashGrid(spacings, rows)), numbers)
 
 
 def upright(background: Placed) -> VMField | None:

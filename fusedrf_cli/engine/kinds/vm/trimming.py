@@ -186,11 +186,18 @@ def in_shape(field: VMField, shape: VMShape) -> VMField:
 
 def without_detail(field: VMField) -> VMField:
     """A field without what is finer than its texels."""
-    if field.shape.hashed is None:
+    return with_detail(field, None)
+
+
+def with_detail(field: VMField, hashed: HashGrid | None) -> VMField:
+    """A field with another detail, which begins as 0, or with none."""
+    if field.shape.hashed is None and hashed is None:
         return field
-    new = in_shape(field, replace(field.shape, hashed=None))
+    new = in_shape(field, replace(field.shape, hashed=hashed))
+    old = field.sections()
     for name, view in new.sections().items():
-        view.copy_(field.sections()[name])
+        if name != DETAIL:
+            view.copy_(old[name])
     return new
 
 
