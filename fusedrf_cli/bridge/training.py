@@ -178,9 +178,11 @@ def fit_settings(
 ) -> TrainConfig:
     """How to fit; UsageProblem where not even the coarsest field is as small as asked, with `besides` more
     bytes in its bundle."""
+    usual = quality_of(request, capture, bounds, device)
     settings = replace(
-        quality_of(request, capture, bounds, device),
+        usual,
         kind=kind.name,
+        rate=usual.rate * kind.photo_rate,
         storage=StorageSetting(request.precision, request.ranks, request.sh_degree),
         seed=request.seed,
         time_budget=request.time_budget,

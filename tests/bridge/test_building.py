@@ -218,6 +218,10 @@ def test_a_student_of_more_numbers_is_told_more_up_to_twice_as_much():
             times * student.distil_config.steps,
         )
         assert found.rgb_steps == student.distil_config.rgb_steps
+    # and where there is time more still, up to twice as much
+    wide = BuilderConfig.told_numbers * 9
+    rays = [student.distil_config_for(wide, seconds).rays for seconds in (100.0, 150.0, 225.0, 300.0, 900.0)]
+    assert [round(r / student.distil_config_for(wide).rays, 3) for r in rays] == [1, 1, 1.5, 2, 2]
     assert Restless(None).distil_config_for(BuilderConfig.told_numbers * 9) is None
 
 

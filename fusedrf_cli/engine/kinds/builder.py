@@ -43,6 +43,10 @@ class BuilderConfig:
     """That are asked for each second of learning."""
     most_told: float = 2.0
     """Four objects in 24 million: 36.4 dB by one lesson, 36.9 by twice the steps, 38.1 by all."""
+    patient: float = 150.0
+    """Seconds of learning from which it is told more still, in proportion, ..."""
+    most_patient: float = 2.0
+    """... up to so many times: the same four after five minutes 34.8 dB without, 35.7 with it."""
 
 
 EACH = "each"  # in place of a precision: every field of a scene has one of its own
@@ -291,12 +295,14 @@ class DistilledBuilder:
 
     def distil_config_for(self, numbers: int, seconds: float | None = None) -> DistilConfig | None:
         """How a student of so many numbers learns, in so many seconds where they are given: the more numbers
-        there are, the more it is told, up to `most_told` times, but no more than there is time to learn
-        from."""
+        there are, the more it is told, up to `most_told` times, and where there is time for more than that,
+        up to `most_patient` times of this; but no more than there is time to learn from."""
         config = current(BuilderConfig)
         if not self.learnt or self.distil_config is None:
             return self.distil_config and replace(self.distil_config, time_budget=seconds)
         more = min(max(1.0, numbers / config.told_numbers), config.most_told)
+        if seconds is not None:
+            more *= min(max(1.0, seconds / config.patient), config.most_patient)
         rays, steps = round(more * self.distil_config.rays), round(more * self.distil_config.steps)
         if seconds is not None:
             rays = min(rays, int(config.rays_per_second * seconds) + 1)

@@ -43,6 +43,8 @@ class Kind:
     """The class of its fields; None for a way of fusing whose fields are another kind's."""
     trains = True
     """Whether a field of it can begin from photos."""
+    photo_rate = 1.0
+    """What it learns from photos at, relative to `TrainConfig.rate`."""
     takes: frozenset[str] = frozenset()
     """Which of StorageSetting's words it heeds, besides the precision: "ranks", "sh_degree"."""
     reduces: frozenset[str] = frozenset()

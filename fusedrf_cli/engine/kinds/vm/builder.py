@@ -49,7 +49,7 @@ class VMBuilderConfig:
     """Times its own voxel: how coarse a field can get before it is left without its detail."""
     noise: float = 0.03
     """Of the factors of a student that takes over others' numbers."""
-    detail_from: int = 6_000_000
+    detail_from: int = 2_000_000
     """Numbers of a student from which it has a detail."""
     detail_seconds: float = 120.0
     """Of learning from which it has one, where the time decides."""
