@@ -130,7 +130,7 @@ def as_device_functions(names: dict) -> dict:
     device_names |= {
         "accumulate": accumulate, "raise_to": raise_to, "scatter_4": scatter_4, "scatter_8": scatter_8,
         "prefetch_density": ahead, "prefetch_colour": ahead, "literally": literally,
-        "fill_lanes": not_filled,
+        "fill_lanes": not_filled, "LANES": 0,
     }  # fmt: skip
     return device_names
 
@@ -141,13 +141,7 @@ class Loops:
     def __init__(self, device_module: ModuleType, sizes: dict[str, int], space: ModuleType):
         self.tag, names = specialise.specialised(device_module, sizes, space)
         room = {"SCRATCH_ROOM": max(sizes["SCRATCH"], 1), "MEMORY_ROOM": max(sizes["KEPT"], 1)}
-        self.names = {
-            **as_device_functions(names),
-            **room,
-            "LANES": 0,
-            "cuda": cuda,
-            "RaySamples": RaySamples,
-        }
+        self.names = {**as_device_functions(names), **room, "cuda": cuda, "RaySamples": RaySamples}
         self.kernels = {}
 
     def each(self, item: str, field, grid, query, count: int, out, per_task: int = POINTS_PER_TASK):
