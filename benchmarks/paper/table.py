@@ -4,7 +4,7 @@ import csv
 import os
 from pathlib import Path
 
-from benchmarks.commit import commit_line
+from benchmarks.commit import commit_column, commit_line
 from benchmarks.paper.work import write_csv
 
 MEASURES = {
@@ -37,7 +37,8 @@ ABOUT = (
     "Written by `make bench-paper` on {cores} CPU cores. PSNR and SSIM are against the naive composition, "
     "mean over views that nothing was trained or chosen on: of the whole scene, and of each object from "
     "where and as large as it was photographed. *Covered* is the PSNR of the pixels that the scene covers, "
-    "*covered share* how many of all they are. Parts that a run leaves out stay as they were."
+    "*covered share* how many of all they are. Parts that a run leaves out stay as they were: "
+    "the tables are of the commits of their measures, sizes of that of the smallest bundle."
 )
 PLOTS = {"capacity": "capacity", "times": "times", "smallest": "chart"}
 
@@ -47,10 +48,10 @@ def update(out: Path, seen: dict[str, str]) -> None:
     kept = {}
     if (out / "measures.csv").exists():
         with (out / "measures.csv").open(newline="", encoding="utf-8") as file:
-            kept = {row["key"]: row["seen"] for row in csv.DictReader(file)}
-    seen = kept | seen
-    columns = ("measure", "the paper", "bar", "aim", "seen")
-    rows = [dict(zip(columns, (*m, seen.get(key, "")), strict=True)) for key, m in MEASURES.items()]
+            kept = {row["key"]: (row["seen"], row["commit"]) for row in csv.DictReader(file)}
+    kept |= {key: (text, commit_column()["commit"]) for key, text in seen.items()}
+    columns = ("measure", "the paper", "bar", "aim", "seen", "commit")
+    rows = [dict(zip(columns, (*m, *kept.get(key, ("", ""))), strict=True)) for key, m in MEASURES.items()]
     write_csv(out / "measures.csv", [{"key": k} | row for k, row in zip(MEASURES, rows, strict=True)])
     (out / "table.md").write_text(page(out, rows), encoding="utf-8")
 

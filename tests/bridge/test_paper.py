@@ -142,10 +142,12 @@ def test_smallest_is_the_least_of_those_that_reach_the_psnr(work, monkeypatch):
 
 def test_the_table_keeps_what_other_parts_saw(work):
     table.update(work.out, {"flat": "1.01"})
+    measures, (_, own) = work.out / "measures.csv", commit_column().popitem()
+    measures.write_text(measures.read_text().replace(own, "1234567"))
     table.update(work.out, {"seeds": "blocks 0.1 dB"})
     page = (work.out / "table.md").read_text()
-    assert "| fused frame time at N = 8 over N = 1 | 1.00 | ≤ 1.10 | ≤ 1.02 | 1.01 |" in page
-    assert "| blocks 0.1 dB |" in page and page.splitlines()[2] == commit_line()
+    assert "| fused frame time at N = 8 over N = 1 | 1.00 | ≤ 1.10 | ≤ 1.02 | 1.01 | 1234567 |" in page
+    assert f"| blocks 0.1 dB | {own} |" in page and page.splitlines()[2] == commit_line()
 
 
 def test_pages_say_the_commit_and_its_date(tmp_path):

@@ -45,7 +45,7 @@ def density(field, grid, index, p, d, scratch):
     strides = density_steps_at(field, cell, unit, index)
     if strides == 0:
         return 0.0, 0.0, 0, (unit, cell)
-    sigma, pre = sigma_forward(field, cell, scratch)
+    sigma, pre = sigma_at(field, unit, cell, scratch)
     return sigma, pre, strides, (unit, density_located(field, cell, scratch))
 
 
@@ -65,16 +65,15 @@ def separate_cell(field, cell):
     return colour_locate(field, cell[0])
 
 
-def looked_density(field, grid, index, p, d, scratch):
-    """`density` where the samples ahead were asked for together (ahead.py)."""
-    unit = unit_of(field, p)
-    cell = density_locate(field, unit)
-    strides = density_steps_at(field, cell, unit, index)
-    if strides == 0:
-        return 0.0, 0.0, 0, (unit, cell)
+def sigma_alone(field, unit, cell, scratch):
+    """What sigma says of a cell."""
+    return sigma_forward(field, cell, scratch)
+
+
+def sigma_known(field, unit, cell, scratch):
+    """The same, by a lane where one knows it (ahead.py)."""
     lane = sigma_lane_of(unit, scratch)
-    sigma, pre = sigma_of_lane(field, lane, scratch) if lane >= 0 else sigma_forward(field, cell, scratch)
-    return sigma, pre, strides, (unit, density_located(field, cell, scratch))
+    return sigma_of_lane(field, lane, scratch) if lane >= 0 else sigma_forward(field, cell, scratch)
 
 
 def lane_of(field, p, scratch):
@@ -291,8 +290,9 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
                 raise ValueError(f"'{name}' of '{module.__name__}' has two meanings")
     templates = {template.__name__: template for template in TEMPLATES}
     templates |= {name: template for name, (template, hook) in OPTIONAL.items() if hook in names}
-    if hasattr(sigma, "fill_lanes") and "density_next_index" not in names:
-        templates |= {"density": looked_density} | {template.__name__: template for template in LOOKING}
+    looks = hasattr(sigma, "fill_lanes") and "density_next_index" not in names
+    templates["sigma_at"] = sigma_known if looks else sigma_alone
+    templates |= {template.__name__: template for template in LOOKING if looks}
     shared = colour is density or getattr(colour, "locate", locate) is None
     templates["colour_cell"] = shared_cell if shared else separate_cell
     if getattr(colour, "READS_SCRATCH", False):

@@ -5,7 +5,6 @@ import pytest
 import torch
 from numba import njit
 
-from fusedrf_cli.engine.kernels import lanes
 from fusedrf_cli.engine.kernels.lanes import LANES, network_lanes
 from fusedrf_cli.engine.kinds.mlp.field import MLPField, MLPShape
 from fusedrf_cli.engine.rendering.volume import render_rays
@@ -116,6 +115,6 @@ def test_rays_are_shown_as_without_lanes(field, monkeypatch):
     np.testing.assert_array_equal(render_rays(field, rays_o[order], rays_d[order]), shown[order])
     alone = field.with_params(field.params)
     sizes = alone.device_module.sizes
+    assert sizes(alone)["LANES"] == LANES
     monkeypatch.setattr(alone.device_module, "sizes", lambda of: sizes(of) | {"LANES": 0})
     np.testing.assert_allclose(render_rays(alone, rays_o, rays_d), shown, atol=1e-5)
-    assert lanes.LANES > 0

@@ -128,7 +128,7 @@ def test_settings_that_cannot_be_read_are_noted(tmp_path):
             b"ply\nformat binary_little_endian 1.0\nproperty float f_dc_0\nend_header\n",
             "Gaussian splats",
         ),
-        ("a.spz", gzip.compress(b"NGSP" + bytes(40)), "Gaussian splats"),
+        ("a.spz", gzip.compress(b"NGSP" + bytes(40), mtime=0), "Gaussian splats"),
         ("a.splat", bytes(64), "Gaussian splats"),
         ("a.glb", b"glTF" + bytes(40), "a mesh"),
         ("a.png", b"\x89PNG\r\n\x1a\n" + bytes(40), "fusedrf train"),
@@ -138,7 +138,7 @@ def test_settings_that_cannot_be_read_are_noted(tmp_path):
         ("a.pth", bytes(100), "known are TensoRF"),
         ("a.pkl", b"\x80\x04]\x94.", "known are TensoRF"),
         ("a.zip", b"PK\5\6" + bytes(18), "known are TensoRF"),
-        ("a.gz", gzip.compress(b"hello"), "known are TensoRF"),
+        ("a.gz", gzip.compress(b"hello", mtime=0), "known are TensoRF"),
     ],
 )
 def test_other_files_are_named(name, data, said, tmp_path):
