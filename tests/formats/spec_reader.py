@@ -219,7 +219,7 @@ def of_networks(kind: str, told: dict, arrays: dict, x: np.ndarray, d: np.ndarra
     here = occupied(cells_of(arrays, "occupancy", cells["counts"]), np.array(cells["aabb"]), y)
     if kind == "hash":
         u = (y - box[:3]) / (box[3:] - box[:3]).max()
-        features = hashed_levels(shape, told["resolution"], arrays["density_rows"], u)
+        features = hashed_levels(shape, told["resolution"], arrays, u)
         weights = arrays["sigma_weights"]
         f = features @ weights[:-1] + weights[-1]
     else:
@@ -241,13 +241,14 @@ def of_networks(kind: str, told: dict, arrays: dict, x: np.ndarray, d: np.ndarra
     return np.where(here, rho * density(f, told), 0), logistic(rgb)
 
 
-def hashed_levels(shape: dict, resolution: list[int], rows: np.ndarray, u: np.ndarray) -> np.ndarray:
+def hashed_levels(shape: dict, resolution: list[int], arrays: dict, u: np.ndarray) -> np.ndarray:
     """2.6: the features of a `hash_grid` of a `hash` field."""
     count, found, first = shape["levels"], [], 0
-    for level in range(count):
-        s = 16 * (shape["finest"] / 16) ** (level / max(count - 1, 1)) - 1
-        side = int(np.ceil(s)) + 1
-        number = min(-(-(side**3) // 8) * 8, 2 ** shape["log2_rows"])
+    scales = [16 * (shape["finest"] / 16) ** (level / max(count - 1, 1)) - 1 for level in range(count)]
+    sides = [int(np.ceil(s)) + 1 for s in scales]
+    numbers = [min(-(-(side**3) // 8) * 8, 2 ** shape["log2_rows"]) for side in sides]
+    rows = all_rows(arrays, "density_rows", sum(numbers))
+    for level, (s, side, number) in enumerate(zip(scales, sides, numbers, strict=True)):
         features = np.zeros((len(u), shape["features"]))
         if level == 0 or s <= 2 * max(resolution):
             low = np.floor(s * u + 0.5).astype(int)
@@ -331,17 +332,23 @@ def network(arrays: dict, u: np.ndarray) -> np.ndarray:
     return i
 
 
+def all_rows(own: dict, name: str, count: int) -> np.ndarray:
+    """2.5: (count, ·) the rows of a hash grid, of which a file may hold few."""
+    if f"{name}_blocks" not in own:
+        return own[name]
+    blocks = -(-count // 64)
+    some = np.unpackbits(own[f"{name}_blocks"])[:blocks].astype(bool)
+    held = np.zeros((blocks, 16), bool)
+    held[some] = np.unpackbits(own[f"{name}_held"], axis=1)
+    whole = np.zeros((count, own[name].shape[1]))
+    whole[np.repeat(held.ravel(), 4)[:count]] = own[name]
+    return whole
+
+
 def detail(own: dict, hashed: dict, y: np.ndarray) -> np.ndarray:
     """2.4 and 2.5: (N, 4)."""
     rows, total = hashed["rows"], np.zeros((len(y), 4))
-    whole = own["detail"]
-    if "detail_blocks" in own:
-        count = len(hashed["spacings"]) * rows
-        some = np.unpackbits(own["detail_blocks"])[: count // 64].astype(bool)
-        held = np.zeros((count // 64, 16), bool)
-        held[some] = np.unpackbits(own["detail_held"], axis=1)
-        whole = np.zeros((count, 4))
-        whole[np.repeat(held.ravel(), 4)] = own["detail"]
+    whole = all_rows(own, "detail", len(hashed["spacings"]) * rows)
     for level, h in enumerate(hashed["spacings"]):
         low = np.floor(y / h).astype(np.int64)
         for corner in CORNERS:

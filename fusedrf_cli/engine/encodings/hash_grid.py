@@ -111,15 +111,21 @@ def reference(
         total = table.new_zeros(len(unit), features)
         for offset in whole(OCTANTS, unit.device):
             weight = torch.where(offset == 1, at - below, 1 - (at - below)).prod(1)
-            x, y, z = (below.long() + offset).unbind(1)
-            number = (z * level["side"] + y) * level["side"] + x
-            if level["hashed"]:
-                number = x ^ (y * PRIMES[0]) ^ (z * PRIMES[1])
-            total = total + weight[:, None].to(table.dtype) * table[first + number % level["rows"]]
+            row = first + row_of(level, below.long() + offset)
+            total = total + weight[:, None].to(table.dtype) * table[row]
         per_level.append(total)
         first += level["rows"]
     filled = table.new_zeros(len(unit), sizes(features, levels)["WIDTH"] - len(per_level) * features)
     return torch.cat([*per_level, filled], 1)
+
+
+def row_of(level: dict, vertex: torch.Tensor) -> torch.Tensor:
+    """(N,) int64: which row of a level its vertices (N, 3) int64 have."""
+    x, y, z = vertex.unbind(1)
+    number = (z * level["side"] + y) * level["side"] + x
+    if level["hashed"]:
+        number = x ^ (y * PRIMES[0]) ^ (z * PRIMES[1])
+    return number % level["rows"]
 
 
 def bound(sections: dict, read: None, features: int, levels: list[dict], grows: bool = False) -> torch.Tensor:

@@ -11,16 +11,20 @@ import torch
 from fusedrf_cli.engine.fields import large_pages
 from fusedrf_cli.engine.fields.base import FieldMemory, check_samples, sampling_step
 from fusedrf_cli.engine.fields.computed import (
+    FEW_CELLS,
     PER_CELL,
     PER_CELL_MADE,
     ComputedField,
     Group,
     Reads,
     packed_bits,
+    runs_of,
     unpack_bits,
 )
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.stored_rows import StoredRows, StoredRowsConfig, folded, unfolded
 from fusedrf_cli.engine.kernels.primitives import LINE
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
 MAX_TEXELS = 8192  # per axis, in a stored field
@@ -72,6 +76,8 @@ class BoxField(ComputedField):
     """
 
     shape_type: type
+    hashed_part: str | None = None
+    """The part, if any, that is the rows of a hash grid: files may hold those alone that are not 0."""
     name = ""
     """Of the object that it is, where its kind's files say so."""
 
@@ -179,6 +185,12 @@ class BoxField(ComputedField):
         return np.asarray(self.resolution, np.int64), self.box[:3].copy(), self.box[3:] - self.box[:3]
 
     @property
+    def held(self) -> StoredRows | None:
+        """Which rows of its hash grid a file holds; None: it has none, or all."""
+        rows = self.sections().get(self.hashed_part)
+        return None if rows is None else StoredRows.of(rows.detach().cpu().numpy())
+
+    @property
     def used(self) -> np.ndarray:
         """(nx, ny, nz) bool: the vertices of voxels that an occupied cell reaches into."""
         return used_vertices(self.occupancy, self.box, self.resolution)
@@ -216,12 +228,14 @@ class BoxField(ComputedField):
 
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and metadata for a bundle: the parts, and occupancy as packed bits."""
-        arrays = {
-            self.stored_name(part.name): self.pack(part, view.detach().cpu()).numpy()
-            for part, view in zip(self.parts, self.sections().values(), strict=True)
-        }
-        arrays |= packed_bits("occupancy", self.occupancy.occupied)
-        metadata = ({} if "occupancy" in arrays else {"needs": ["held"]}) | {
+        arrays = {}
+        for part, view in zip(self.parts, self.sections().values(), strict=True):
+            name, packed = self.stored_name(part.name), self.pack(part, view.detach().cpu()).numpy()
+            arrays |= folded(name, packed) if part.name == self.hashed_part else {name: packed}
+        held = self.hashed_part is not None and runs_of(self.stored_name(self.hashed_part)) in arrays
+        arrays |= packed_bits("occupancy", self.occupancy.occupied, 0 if held else FEW_CELLS)
+        needs = ["held", "runs"] if held else [] if "occupancy" in arrays else ["held"]
+        metadata = ({"needs": needs} if needs else {}) | {
             "aabb": self.box.tolist(),
             "resolution": list(self.resolution),
             "scale": self.scale,
@@ -256,7 +270,10 @@ class BoxField(ComputedField):
 
     def unpack(self, part: ParameterBlock, stored: torch.Tensor, values: torch.Tensor) -> None:
         """Inverse of `pack`, into a part that is 0, as what is not stored stays."""
-        if part.on_vertices:
+        if part.name == self.hashed_part:  # rows of 0 take no memory
+            rows = stored.any(1)
+            values[rows] = stored[rows]
+        elif part.on_vertices:
             rows = values.view(math.prod(self.resolution), -1)
             width = math.prod(stored.shape[1:])
             used = torch.from_numpy(np.flatnonzero(self.used))
@@ -307,6 +324,7 @@ class BoxField(ComputedField):
         grid = cls.stored_cells(metadata["cells"], arrays)
         bare = cls(shape, checked_box(box, "aabb"), resolution, scale, shift, torch.zeros(0), grid)
         check_samples(grid.space.most_samples(grid.aabb, sampling_step(bare)), "the field")
+        arrays = bare.with_all_rows(arrays)
         for part in bare.parts:  # before `params` takes memory
             name, expected = cls.stored_name(part.name), bare.stored_shape(part)
             array = arrays.get(name)
@@ -319,6 +337,19 @@ class BoxField(ComputedField):
             field.unpack(part, stored, view)
         field.check_answers()
         return field
+
+    def with_all_rows(self, arrays: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+        """A file's arrays with all rows of the hash grid, of which they may have few. Raises ValueError where
+        these do not fit, or the field has more numbers than are read."""
+        part = next((part for part in self.parts if part.name == self.hashed_part), None)
+        if part is None:
+            return arrays
+        most = current(StoredRowsConfig).max_numbers
+        if self.size > most:
+            raise ValueError(f"it has {self.size:,} numbers, but at most {most:,} are read")
+        name = self.stored_name(part.name)
+        rows = unfolded(name, part.shape, arrays)
+        return arrays if rows is None else {**arrays, name: rows}
 
     def check_density(self, largest: float) -> None:
         """Raise ValueError where a density feature of that size gives an answer beyond MAX_ANSWER."""

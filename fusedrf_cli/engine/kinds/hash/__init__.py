@@ -5,9 +5,12 @@ import math
 import torch
 
 from fusedrf_cli.engine.encodings.hash_grid import FINER
+from fusedrf_cli.engine.fields.stored_rows import StoredRows
 from fusedrf_cli.engine.kinds.box_kind import BoxKind
-from fusedrf_cli.engine.kinds.builder import Plan, StorageSetting
-from fusedrf_cli.engine.kinds.hash.field import BASE, HashField, HashShape
+from fusedrf_cli.engine.kinds.builder import Contents, Plan, Section, StorageSetting
+from fusedrf_cli.engine.kinds.hash.field import BASE, ROWS, HashField, HashShape
+from fusedrf_cli.engine.kinds.hash.trimming import rows_used, without_unasked, without_unused
+from fusedrf_cli.engine.kinds.reduction import Reduction, coarser
 
 MOST_ROWS = 19  # log2, of a level: a step looks through the gradients of all
 
@@ -33,6 +36,44 @@ class HashKind(BoxKind):
         for name in new.keys() - {"density_rows"}:
             new[name].copy_(old[name])
         return field.with_occupancy(before.occupancy)
+
+    def outline(self, field: HashField) -> HashField:
+        """See Kind: it knows which rows are other than 0."""
+        outline = super().outline(field)
+        outline.told = StoredRows.other_than_0(field.sections()[ROWS].detach().cpu().numpy())
+        return outline
+
+    def reduction(self, outline: HashField, voxel: float, storage: StorageSetting) -> Reduction:
+        """See Kind: without the levels that wider texels leave out."""
+        box, resolution = outline.box, coarser(outline.box, outline.resolution, voxel)
+        same, unit = resolution == outline.resolution, (outline.scale, outline.shift)
+        small = HashField(outline.shape, box, resolution, *unit, outline.params, outline.occupancy)
+
+        def make(field: HashField) -> HashField:
+            return field if same else without_unused(field.resampled(box, resolution))
+
+        return Reduction(contents_of(small, outline.told), make, same)
+
+    def trimmed(self, field: HashField) -> HashField:
+        """See hash/trimming.py."""
+        return without_unasked(field)
+
+    def describe(self, field: HashField) -> dict:
+        """Texels per axis, levels that they leave in, and rows that a file holds."""
+        levels, held = field.used_levels, field.held
+        rows = held.count if held else sum(level["rows"] for level in field.shape.grids)
+        return super().describe(field) | {"levels": len(levels), "rows": rows}
+
+
+def contents_of(field: HashField, other_than_0: StoredRows) -> Contents:
+    """What a field without unused rows is stored with, of which only those say something."""
+    held, bits = other_than_0.first(rows_used(field)), field.occupancy.occupied.size
+    sections = [Section(part.name, field.stored_shape(part)) for part in field.parts]
+    if held.saves(field.shape.features):
+        bits += held.told(field.shape.features)
+        few = held.count, field.shape.features
+        sections = [Section(s.name, few) if s.name == ROWS else s for s in sections]
+    return Contents(sections, bits)
 
 
 KIND = HashKind()

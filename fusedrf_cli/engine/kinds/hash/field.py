@@ -11,6 +11,7 @@ from fusedrf_cli.engine.encodings import hash_grid, trunk_features
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot, check_counts
 from fusedrf_cli.engine.settings import current
 
+ROWS = "density_rows"
 BASE = 16  # vertices along an axis of the coarsest level
 
 
@@ -54,6 +55,7 @@ class HashField(AssembledField):
 
     kind = "hash"
     shape_type = HashShape
+    hashed_part = ROWS
     over_texels = False
 
     @classmethod
@@ -63,11 +65,17 @@ class HashField(AssembledField):
         rows = {"features": shape.features, "levels": shape.grids, "grows": True}
         width = hash_grid.sizes(**rows)["WIDTH"]
         return {
-            "density": Slot(hash_grid, rows, "density_", config.rows_rate),
+            "density": Slot(hash_grid, rows, ROWS.removesuffix("rows"), config.rows_rate),
             "colour": Slot(trunk_features, {"outputs": width}),
             "sigma": Slot(density_linear, {"width": width}, "sigma_", config.density_rate),
             "rgb": Slot(sh_mlp, {"width": width, "hidden": shape.hidden}, "rgb_", config.network_rate),
         }
+
+    @property
+    def used_levels(self) -> list[dict]:
+        """Those that its texels do not leave out."""
+        levels = self.shape.grids
+        return levels[: hash_grid.used_of(self.resolution, levels, True)]
 
     @property
     def cube(self) -> tuple[np.ndarray, np.ndarray]:

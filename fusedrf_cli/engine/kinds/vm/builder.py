@@ -10,6 +10,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.encodings.hash_runs import ROW, HashGrid
 from fusedrf_cli.engine.fields.assembled import MAX_RANK
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, overlapped
+from fusedrf_cli.engine.fields.stored_rows import StoredRows
 from fusedrf_cli.engine.kinds.box_kind import BoxKind
 from fusedrf_cli.engine.kinds.builder import (
     BuildRequest,
@@ -23,7 +24,6 @@ from fusedrf_cli.engine.kinds.builder import (
 )
 from fusedrf_cli.engine.kinds.reduction import Reduction, coarser
 from fusedrf_cli.engine.kinds.vm.field import DETAIL, VMField, VMShape
-from fusedrf_cli.engine.kinds.vm.stored_entries import PER_BLOCK, TOGETHER, StoredEntries
 from fusedrf_cli.engine.kinds.vm.trimming import (
     common_shape,
     components,
@@ -224,7 +224,7 @@ def add_noise(student: VMField, generator: torch.Generator) -> None:
             section += current(VMBuilderConfig).noise * torch.randn(section.shape, generator=generator)
 
 
-def contents_of(field: VMField, held: StoredEntries | None) -> Contents:
+def contents_of(field: VMField, held: StoredRows | None) -> Contents:
     """What a field without unread texels (trimming.py) is stored with, whatever its numbers are; held: which
     rows of its hash grid."""
     sections, bits = [], field.occupancy.occupied.size + 8  # packed by itself
@@ -233,6 +233,6 @@ def contents_of(field: VMField, held: StoredEntries | None) -> Contents:
         shape = part.shape
         if part.name == DETAIL and held:
             shape = held.count, ROW
-            bits += len(held.rows) // TOGETHER + 8 * PER_BLOCK * len(held.masks)
+            bits += held.told(ROW)
         sections.append(Section(part.name, shape, used))
     return Contents(sections, bits)

@@ -15,10 +15,10 @@ import torch
 from fusedrf_cli.engine.composition.affine import WHITE
 from fusedrf_cli.engine.decoders import density_sum, sh_basis
 from fusedrf_cli.engine.encodings import plane_line, plane_line_hash
-from fusedrf_cli.engine.encodings.hash_runs import ROW, HashGrid
+from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.assembled import AssembledField, RankedShape, Slot
 from fusedrf_cli.engine.fields.base import FieldMemory
-from fusedrf_cli.engine.fields.box import LINE, ParameterBlock, checked_box, whole_numbers
+from fusedrf_cli.engine.fields.box import LINE, checked_box, whole_numbers
 from fusedrf_cli.engine.fields.computed import (
     FEW_CELLS,
     PER_CELL,
@@ -28,7 +28,7 @@ from fusedrf_cli.engine.fields.computed import (
     runs_of,
 )
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kinds.vm.stored_entries import StoredEntries
+from fusedrf_cli.engine.fields.stored_rows import folded
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, name_of
 
@@ -41,8 +41,6 @@ class VMConfig:
     """Of a field, from which on its cells are stored in bricks where these are smaller."""
     basis_rate: float = 0.15
     """Of the factors'; at a third of it, as in TensoRF, a fox after a minute shows 0.5 dB less."""
-    max_numbers: int = 2 << 30
-    """Of a field that is read: of a hash grid a file may hold few rows."""
 
 
 DETAIL = "density_detail"  # the rows of the hash grid
@@ -60,6 +58,7 @@ class VMField(AssembledField):
 
     kind = "vm"
     shape_type = VMShape
+    hashed_part = DETAIL
 
     @classmethod
     def slots_of(cls, shape: VMShape) -> dict[str, Slot]:
@@ -101,11 +100,6 @@ class VMField(AssembledField):
         step = self.space.picture_step(self.voxel_size)
         return step if self.shape.hashed is None else min(step, self.shape.hashed.picture_step)
 
-    @property
-    def held(self) -> StoredEntries | None:
-        """Which rows of its hash grid a file holds; None: it has none, or all."""
-        return StoredEntries.of(self.sections()[DETAIL].detach().cpu().numpy()) if self.shape.hashed else None
-
     # -- storing ---------------------------------------------------------------------------------------------
 
     @classmethod
@@ -120,11 +114,7 @@ class VMField(AssembledField):
         arrays = {self.stored_name(name): view.detach().cpu().numpy() for name, view in own}
         rows = self.stored_name(DETAIL)
         if rows in arrays:  # as files have always had them, last
-            detail, held = arrays.pop(rows), self.held
-            arrays[rows] = detail if held is None else detail[held.rows]
-            if held is not None:
-                arrays[runs_of(rows)] = held.lengths
-                arrays |= {f"{rows}_{name}": bits for name, bits in held.state().items()}
+            arrays |= folded(rows, arrays.pop(rows))
         return arrays
 
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
@@ -169,24 +159,9 @@ class VMField(AssembledField):
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMField":
         """See BoxField."""
-        config = current(VMConfig)
-        own = box_metadata(cls.kind, metadata)
-        numbers = cls.size_of(
-            cls.shape_type(**own["shape"]), whole_numbers(own["resolution"], 2, "resolution")
-        )
-        if numbers > config.max_numbers:
-            raise ValueError(f"it has {numbers:,} numbers, but at most {config.max_numbers:,} are read")
-        field = super().from_state(with_all_rows(arrays, own["shape"].get("hashed")), own)
+        field = super().from_state(arrays, box_metadata(cls.kind, metadata))
         field.name = str(metadata["blocks"][0]["name"])
         return field
-
-    def unpack(self, part: ParameterBlock, stored: torch.Tensor, values: torch.Tensor) -> None:
-        """See BoxField; rows of 0 take no memory."""
-        if part.name == DETAIL:
-            rows = stored.any(1)
-            values[rows] = stored[rows]
-        else:
-            super().unpack(part, stored, values)
 
 
 def box_metadata(kind: str, metadata: dict) -> dict:
@@ -231,22 +206,3 @@ def hashed_of(stored: dict, box: np.ndarray) -> HashGrid:
             f"{np.abs(box).max():g} and its 'spacings' are {list(hashed.spacings)}"
         )
     return hashed
-
-
-def with_all_rows(arrays: dict[str, np.ndarray], hashed: HashGrid | None) -> dict[str, np.ndarray]:
-    """The arrays with all rows of a hash grid, of which a file may hold few. Raises ValueError naming what
-    does not fit."""
-    name = VMField.stored_name(DETAIL)
-    blocks, runs = (arrays.get(f"{name}_{which}") for which in ("blocks", "held"))
-    if hashed is None or blocks is None or runs is None:
-        return arrays
-    held = StoredEntries.from_state(blocks, runs, hashed.shape[0])
-    lengths, stored = arrays.get(runs_of(name)), arrays.get(name)
-    if lengths is None or not np.array_equal(lengths, held.lengths):
-        raise ValueError(f"the runs of array '{name}' are not those of its blocks")
-    if stored is None or stored.shape != (held.count, ROW):
-        have = "nothing" if stored is None else list(stored.shape)
-        raise ValueError(f"array '{name}' should have shape {[held.count, ROW]}, found {have}")
-    whole = np.zeros(hashed.shape, stored.dtype)
-    whole[held.rows] = stored
-    return arrays | {name: whole}

@@ -1,15 +1,15 @@
 """VM fields with other numbers of components, and leaving out of them what pictures do not need: texels and
 rows of a hash grid that nothing reads, and components of little energy."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import product
+from functools import partial
 
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.encodings.hash_runs import EMPTY_FROM, HashGrid, hashed_row
 from fusedrf_cli.engine.encodings.plane_line import MODES
+from fusedrf_cli.engine.kinds.asked_rows import Lattice, asked_rows
 from fusedrf_cli.engine.kinds.vm.field import DETAIL, VMField, VMShape
 from fusedrf_cli.engine.settings import current
 
@@ -23,11 +23,7 @@ class TrimmingConfig:
     regular: float = 1e-9
     """Of the largest entry of a Gram matrix, added to its diagonal."""
     rounded: float = 1e-3
-    """Of a density before activation, and of the spacing of vertices: more than rounding makes of them."""
-    most_met: float = 8.0
-    """Cells of a detail's lattice for each of its rows: then nine in ten of the rows are asked."""
-    vertices_at_once: int = 1 << 22
-    """Of a lattice: some 100 MB."""
+    """Of a density before activation: more than rounding makes of it."""
 
 
 def read_texels(field: VMField, mode: int) -> np.ndarray:
@@ -79,17 +75,9 @@ def without_unqueried(field: VMField) -> VMField:
 
 def queried_rows(field: VMField, hashed: HashGrid) -> np.ndarray:
     """(R,) bool: the rows of a field's hash grid that some point of an occupied cell asks, where planes and
-    lines say that there may be density; all of a level of which so many cells are met that most are."""
-    texels, sides, occupied = occupied_texels(field), field.box[3:] - field.box[:3], field.occupancy.occupied
-    queried = np.zeros(hashed.shape[0], bool)
-    for level, spacing in enumerate(hashed.spacings):
-        own = queried[level * hashed.rows : (level + 1) * hashed.rows]
-        if occupied.mean() * (sides / spacing).prod() > current(TrimmingConfig).most_met * hashed.rows:
-            own[:] = True
-            continue
-        for vertices in met_vertices(field.box, (texels, occupied), spacing):
-            own[hashed_row(hashed, torch.from_numpy(vertices)).numpy()] = True
-    return queried
+    lines say that there may be density."""
+    levels = [Lattice(field.box, h, hashed.rows, partial(hashed_row, hashed)) for h in hashed.spacings]
+    return asked_rows(levels, (occupied_texels(field), field.occupancy.occupied))
 
 
 def occupied_texels(field: VMField) -> np.ndarray:
@@ -106,42 +94,6 @@ def occupied_texels(field: VMField) -> np.ndarray:
         square = high[:-1, :-1] | high[1:, :-1] | high[:-1, 1:] | high[1:, 1:]
         cells.append(square)
     return np.stack([one | other for one, other in zip(cells[:-1], cells[1:], strict=True)])
-
-
-def met_vertices(box: np.ndarray, masks: tuple[np.ndarray, ...], spacing: float) -> Iterator[np.ndarray]:
-    """(N, 3) int64, a part after the other: the vertices of a lattice of that spacing around the points of a
-    box (6,) that lie in marked cells (X, Y, Z) of all the masks over it."""
-    config = current(TrimmingConfig)
-    first = np.floor(box[:3] / spacing - config.rounded).astype(np.int64)
-    count = np.floor(box[3:] / spacing + config.rounded).astype(np.int64) + 1 - first
-    layers = max(1, config.vertices_at_once // int(count[1:].prod()))
-    for start in range(0, count[0], layers):
-        low, sides = first + [start, 0, 0], np.array([min(layers, count[0] - start), *count[1:]])
-        cells = np.ones(sides, bool)
-        for mask in masks:
-            cells &= overlapping(mask, box, low, sides, spacing)
-        met = np.zeros(sides + 1, bool)
-        for corner in product((0, 1), repeat=3):
-            met[tuple(slice(c, c + n) for c, n in zip(corner, sides, strict=True))] |= cells
-        yield np.argwhere(met) + low
-
-
-def overlapping(
-    mask: np.ndarray, box: np.ndarray, low: np.ndarray, sides: np.ndarray, spacing: float
-) -> np.ndarray:
-    """(sides) bool: which cells of a lattice of that spacing, from the one at `low` (3,) on, meet one of the
-    marked cells (X, Y, Z) of a box (6,)."""
-    for axis, cells in enumerate(mask.shape):
-        ends = (low[axis] + np.arange(sides[axis] + 1)) * spacing - box[axis]
-        at, off = ends / (box[axis + 3] - box[axis]) * cells, current(TrimmingConfig).rounded * spacing
-        off *= cells / (box[axis + 3] - box[axis])
-        begin = np.floor(at[:-1] - off).clip(0, cells - 1).astype(np.int64)
-        last = (np.ceil(at[1:] + off) - 1).clip(0, cells - 1).astype(np.int64)
-        met = mask.take(begin, axis)
-        for step in range(1, int((last - begin).max()) + 1):
-            met |= mask.take(np.minimum(begin + step, last), axis)
-        mask = met
-    return mask
 
 
 def components(shape: VMShape) -> tuple[int, ...]:
