@@ -16,7 +16,7 @@ from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.posing import posed_capture
 from fusedrf_cli.bridge.scene_bounds import SceneBounds, SceneBoundsConfig, near_of
-from fusedrf_cli.bridge.training import fit_memory, fit_settings, warn_of_nonfinite
+from fusedrf_cli.bridge.training import fit_memory, fit_settings, trained_kind, warn_of_nonfinite
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField, occupied_at
 from fusedrf_cli.engine.composition.composite import as_composite
@@ -184,8 +184,8 @@ def learnt_from(
     progress.phase("reading photos", None)
     capture = posed_as(posed_capture(request.refit, None, request.threads, progress), frame, progress)
     bounds = bounds_like(frame, capture)
-    kind = registry.kind(registry.DEFAULT)
     train_request = default_training(request)
+    kind = trained_kind(train_request, bounds.unbounded)
     settings = fit_settings(train_request, kind, capture, bounds, device)
     plan = kind.untrained(bounds.box, settings.longest, settings.storage)
     memory.expect(fit_memory(capture, plan, settings), advice="give fewer or smaller photos")

@@ -169,6 +169,11 @@ def refuse_options(kind: Kind, request: FuseRequest | TrainRequest) -> None:
             raise UsageProblem(f"{option} does not apply to kind '{kind.name}'; leave it out")
 
 
+def takes_options(kind: Kind, request: TrainRequest) -> bool:
+    """Whether a kind heeds all options that are given."""
+    return all(word in kind.takes for word in OPTIONS if getattr(request, word) is not None)
+
+
 def note_options(request: FuseRequest, loaded: LoadedScene, progress) -> None:
     """Say which of the sources, which stay fields of their own, do not heed an option; UsageProblem where
     none does."""

@@ -133,9 +133,10 @@ def train(request: TrainRequest, progress) -> dict:
         memory = Memory(request.memory)
         check_checkpoint(request.output, request.resume, request.overwrite)
         saved = load_checkpoint(request.output, "train") if request.resume else None
-        kind = trained_kind(request)
+        trained_kind(request)  # before anything is read
         progress.phase("reading", None)
         sources = read_sources(request, progress)
+        kind = trained_kind(request, any(source.bounds.unbounded for source in sources))
         plan(request, kind, sources, memory, device)
         for source in sources:
             source.begin()

@@ -11,7 +11,7 @@ from formats.views import Capture, check_parallax, hold_out
 from fusedrf_cli.bridge.memory import decoding, fitting, photos
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.posing import posed_capture
-from fusedrf_cli.bridge.scene import refuse_options, unusable_kind
+from fusedrf_cli.bridge.scene import refuse_options, takes_options, unusable_kind
 from fusedrf_cli.bridge.scene_bounds import SceneBounds
 from fusedrf_cli.bridge.sizes import BundleSizes, HeaderConfig, section_bytes
 from fusedrf_cli.engine.distillation.config import TrainConfig
@@ -85,12 +85,20 @@ class TrainPresets:
     a minute what they do in ten."""
 
 
-def trained_kind(request: TrainRequest) -> Kind:
-    """The kind that was asked for; UsageProblem where none of its fields can begin from photos, or share what
-    they are to share."""
-    usual = registry.SHARING if request.shared_decoder else registry.DEFAULT
+def usual_kind(request: TrainRequest, unbounded: bool) -> str:
+    """What sources become where no kind is asked for: one that takes the options that are."""
+    if request.shared_decoder:
+        return registry.SHARING
+    if unbounded and takes_options(registry.kind(registry.SURROUNDINGS), request):
+        return registry.SURROUNDINGS
+    return registry.DEFAULT
+
+
+def trained_kind(request: TrainRequest, unbounded: bool = False) -> Kind:
+    """The kind that was asked for, or the usual one of sources of which some are `unbounded`; UsageProblem
+    where none of its fields can begin from photos, or share what they are to share."""
     try:
-        kind = registry.kind(request.kind or usual)
+        kind = registry.kind(request.kind or usual_kind(request, unbounded))
     except ValueError as error:
         raise unusable_kind(error) from error
     if not kind.trains:

@@ -18,7 +18,9 @@ from fusedrf_cli.requests import TrainRequest
 @click.argument("source", metavar="SOURCE...", nargs=-1, required=True, type=InputType())
 @options.writing("The bundle to write, FIELD.rfpack.")
 @click.option(
-    "--kind", type=FieldKindType(), help="Kind of field; default: vm, with --shared-decoder dense-mlp."
+    "--kind",
+    type=FieldKindType(),
+    help="Kind of field; default: hash of surroundings, else vm; with --shared-decoder dense-mlp.",
 )
 @click.option(
     "--shared-decoder",

@@ -20,7 +20,8 @@ WAYS = {INSTANCES: f"{__package__}.instances"}
 """Ways of fusing whose fields are of other kinds, and the modules that hold them."""
 IMPORTED = frozenset({"assembled", "splats"})
 """Kinds that other systems' files become; nothing is learnt as one of them."""
-DEFAULT = "vm"  # what photos become where no kind is named
+DEFAULT = "vm"  # what photos of an object, or meshes, become where no kind is named
+SURROUNDINGS = "hash"  # what photos of surroundings become
 SHARING = "dense-mlp"  # what photos of several captures become that share a decoder
 
 
