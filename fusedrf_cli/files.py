@@ -22,7 +22,7 @@ from formats.scene import (
 from formats.sources import inline_scenes, resolve_source
 from fusedrf_cli import __version__
 from fusedrf_cli.errors import InvalidInput
-from fusedrf_cli.placement import lying_note
+from fusedrf_cli.placement import common_up, lying_note
 from fusedrf_cli.request_parts import STDIO
 from fusedrf_cli.requests import (
     ComposeRequest,
@@ -43,14 +43,14 @@ def compose(request: ComposeRequest, progress) -> dict:
     summaries = [read_summary(entry.path) for entry in inputs]
     named = zip(inputs, _names(inputs), strict=True)
     nodes = tuple(_node(entry, name, request) for entry, name in named)
-    scene = SceneGraph(nodes, request.composition, generator=f"fusedrf {__version__}")
+    ups, placed = [summary["up"] for summary in summaries], [node.node_to_parent for node in nodes]
+    up = common_up(ups, placed)
+    scene = SceneGraph(nodes, request.composition, generator=f"fusedrf {__version__}", up=up)
     inline_scenes(scene, request.output, request.allow_outside)
-    lying = [
-        lying_note(entry.path, summary["up"], node.node_to_parent)
-        for entry, node, summary in zip(inputs, nodes, summaries, strict=True)
-    ]
-    for note in filter(None, dict.fromkeys(lying)):
-        progress.warn(note)
+    if up is None:
+        lying = map(lying_note, (entry.path for entry in inputs), ups, placed)
+        for note in filter(None, dict.fromkeys(lying)):
+            progress.warn(note)
     if request.output == STDIO:
         sys.stdout.buffer.write(dump_scene(scene))
         sys.stdout.flush()

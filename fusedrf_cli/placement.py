@@ -48,13 +48,27 @@ def quaternion(degrees: Vector) -> tuple[float, float, float, float]:
     )
 
 
-def lying_note(path: str, up: Sequence[float] | None, placed: Sequence[Sequence[float]]) -> str | None:
-    """What is to be said of a source that is placed by a (4, 4) in a scene with +z up, and does not stand
-    upright in it; None where it does. up: which way is up in its own world; None: +z."""
-    if up is None:
+def placed_up(up: Sequence[float] | None, placed: Sequence[Sequence[float]]) -> Vector:
+    """Which way what is up in a source's world, None: +z, points in a scene that places it by a (4, 4); of
+    length 1."""
+    there = [sum(a * b for a, b in zip(row[:3], up or (0, 0, 1), strict=True)) for row in placed[:3]]
+    return tuple(part / math.hypot(*there) for part in there)
+
+
+def common_up(ups: Sequence[Sequence[float] | None], placed: Sequence) -> Vector | None:
+    """The up of a scene that places sources, as `placed_up` takes them, which all stand upright by another
+    up than +z; None where they do not."""
+    if not any(ups):
         return None
-    there = [sum(a * b for a, b in zip(row[:3], up, strict=True)) for row in placed[:3]]
-    if there[2] >= STANDS * math.hypot(*there):
+    first, *others = (placed_up(*source) for source in zip(ups, placed, strict=True))
+    alike = all(sum(a * b for a, b in zip(first, up, strict=True)) >= STANDS for up in others)
+    return first if alike and first[2] < STANDS else None
+
+
+def lying_note(path: str, up: Sequence[float] | None, placed: Sequence[Sequence[float]]) -> str | None:
+    """What is to be said of a source that is placed in a scene with +z up, as `placed_up` takes it, and does
+    not stand upright in it; None where it does."""
+    if up is None or placed_up(up, placed)[2] >= STANDS:
         return None
     turn = ",".join(f"{angle:.6g}" for angle in turn_upright(up))
     axis = AXES.get(tuple(up), ",".join(f"{part:.3g}" for part in up))

@@ -146,3 +146,22 @@ def test_a_source_that_would_lie_on_its_side_is_told_once(run, folder):
     assert upright.stderr == "" and json.loads(upright.stdout)["nodes"]
     said = json.loads(run("info", "plant.rfpack", "--json").stdout)
     assert said["up"] == [0.0, -1.0, 0.0]
+
+
+def test_a_scene_has_the_up_that_all_its_sources_have(run, folder):
+    """As placed: turned about it they stand, turned alike they have another."""
+    record = next(iter(read_bundle("chair.rfpack").fields.values()))
+    for name in ("plant", "pot"):
+        write_single(f"{name}.rfpack", record, name, up=(0.0, -1.0, 0.0))
+
+    def composed(*inputs):
+        result = run("compose", *inputs, "-o", "-")
+        assert result.exit_code == 0
+        return json.loads(result.stdout).get("up"), result.stderr
+
+    same = composed("plant.rfpack", "pot.rfpack", "-t", "1,0,0", "-r", "0,50,0", "-s", "0.1,2,1")
+    assert same == ([0.0, -1.0, 0.0], "")
+    up, told = composed("plant.rfpack", "-r", "0,0,90", "pot.rfpack", "-r", "0,0,80")
+    assert up == pytest.approx([1, 0, 0]) and not told
+    up, told = composed("plant.rfpack", "pot.rfpack", "-r", "-90,0,0")
+    assert up is None and told.count("makes it stand upright") == 1
