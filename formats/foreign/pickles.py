@@ -5,6 +5,7 @@ is looked up in the caller's table, which has a function of ours for each name.
 """
 
 import pickletools
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import BinaryIO
 
@@ -59,20 +60,27 @@ def read_pickle(
     dictionaries may be shared; only `stored.check_plain` tells that nothing but plain values is left in them.
     Raises BadCheckpoint, NeedsCode, LimitExceeded.
     """
-    machine, start = _Machine(known, persistent), file.tell()
+    machine = _Machine(known, persistent)
     try:
-        for count, (name, argument, position) in enumerate(_instructions(file, end)):
-            if count == MAX_INSTRUCTIONS:
-                raise LimitExceeded(f"its pickle has more than {MAX_INSTRUCTIONS:,} instructions")
-            machine.do(name, argument)
-            if machine.work > FREE_WORK + WORK_PER_BYTE * (position - start):
-                raise LimitExceeded("its pickle makes large values of few bytes")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of unusual escapes in texts, which would be printed
+            _carry_out(machine, file, end)
         (value,) = machine.stack
     except FormatError:
         raise
     except (ValueError, TypeError, LookupError, OverflowError, AttributeError) as error:
         raise BadCheckpoint(f"its pickle is damaged ({error}); copy the file again") from error
     return value
+
+
+def _carry_out(machine: "_Machine", file: BinaryIO, end: int) -> None:
+    start = file.tell()
+    for count, (name, argument, position) in enumerate(_instructions(file, end)):
+        if count == MAX_INSTRUCTIONS:
+            raise LimitExceeded(f"its pickle has more than {MAX_INSTRUCTIONS:,} instructions")
+        machine.do(name, argument)
+        if machine.work > FREE_WORK + WORK_PER_BYTE * (position - start):
+            raise LimitExceeded("its pickle makes large values of few bytes")
 
 
 def _instructions(file: BinaryIO, end: int) -> Iterator[tuple[str, object, int]]:

@@ -31,12 +31,17 @@ from formats.safe_input import open_input
 NGP_VERSION = 1
 ENDINGS = (".th", ".tar", ".pth", ".pt", ".ckpt", ".npz", ".ingp", ".msgpack")
 """Of files of a folder that may be a run's checkpoints, beside those named `checkpoint_N`."""
-FOLDERS = ("nerfstudio_models", "checkpoints")
+FOLDERS = ("nerfstudio_models", "checkpoints", "ckpts")
 """Folders of a run that hold its checkpoints."""
 MAX_FILES = 2000
 MAX_TRIED = 50
 MAX_NAMES = 50_000
 """Names of a checkpoint that its system is told by."""
+CAPTURED = (
+    "active_sh_degree", "_xyz", "_features_dc", "_features_rest", "_scaling", "_rotation", "_opacity",
+    "max_radii2D", "xyz_gradient_accum", "denom", "optimizer", "spatial_lr_scale",
+)  # fmt: skip
+"""What 3DGS saves of its model, in this order and without these names."""
 
 
 @dataclass(frozen=True)
@@ -119,8 +124,13 @@ def _entries(path: Path) -> dict:
 
 
 def _table(value: object) -> dict:
-    """A torch file's dictionary; anything else under the name of its type."""
-    return value if isinstance(value, dict) else {type(value).__name__: value}
+    """A torch file's dictionary; what 3DGS saves, by its names; anything else under that of its type."""
+    match value:
+        case dict():
+            return value
+        case ((*model,), int() as step) if len(model) == len(CAPTURED) and isinstance(model[1], StoredTensor):
+            return {"gaussians": dict(zip(CAPTURED, model, strict=True)), "iteration": step}
+    return {type(value).__name__: value}
 
 
 def _unzipped(head: bytes) -> bytes:
@@ -259,6 +269,20 @@ SYSTEMS = {  # the first whose rule fits counts
         ("config.yml", "dataparser_transforms.json"),
     ),
     "k-planes": System("K-Planes", "model/field.grids.0.0:* model/field.sigma_net.params:*", ("config.py",)),
+    "splatfacto": System(
+        "nerfstudio's splatfacto",
+        "pipeline/*_model.*means:*x3 pipeline/*_model.*quats:*x4 pipeline/*_model.*features_dc:*",
+        ("config.yml", "dataparser_transforms.json"),
+    ),
+    "gsplat": System(
+        "gsplat",
+        "splats/means*:*x3 splats/quats:*x4 splats/sh0:*"
+        "| splats/means*:*x3 splats/quats:*x4 splats/colors:* splats/features:*",
+        ("cfg.yml", "cfg.json"),
+    ),
+    "3dgs": System(
+        "3D Gaussian splatting", "gaussians/_xyz:*x3 gaussians/_rotation:*x4 gaussians/_features_dc:*x1x3"
+    ),
     "d2nerf": System("D²NeRF", "optimizer/target/model/static_nerf:*", ("options.json", "config.gin")),
 }
 
@@ -301,12 +325,14 @@ def _files(folder: Path) -> list[Path]:
             files = [
                 file
                 for file in sorted(place.iterdir())[:MAX_FILES]
-                if (file.suffix in ENDINGS or re.fullmatch(r"checkpoint_\d+", file.name)) and file.is_file()
+                if (file.suffix in ENDINGS or re.fullmatch(r"checkpoint_\d+", file.name))
+                and not re.search(r"_rank[1-9]\d*$", file.stem)  # other GPUs' parts of the same checkpoint
+                and file.is_file()
             ]
     return sorted(files, key=_rank, reverse=True)
 
 
 def _rank(file: Path) -> tuple[bool, bool, int]:
     """How new a checkpoint is by its name."""
-    number = re.search(r"(\d{1,18})$", file.stem)
+    number = re.search(r"(\d{1,18})(?:_rank\d+)?$", file.stem)
     return not file.stem.startswith("coarse"), "last" in file.stem, int(number[1]) if number else -1

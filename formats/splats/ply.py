@@ -23,6 +23,7 @@ from formats.splats.splats import (
     not_honoured,
     of_colours,
     sigmoid,
+    sizes_of,
 )
 
 HEADER = re.compile(
@@ -94,10 +95,7 @@ def _plain(path, vertices: _Columns, up: tuple[float, float, float], notes: list
     check_count(path, len(centres))
     axes, rest = _series(vertices, "scale_")[:3], _series(vertices, "f_rest_")
     opacities = sigmoid(vertices.rows(["opacity"])[:, 0])
-    scales = np.exp(vertices.rows(axes or ["scale_0"]).astype(np.float64))
-    if len(axes) < 3:
-        scales = np.pad(scales, [(0, 0), (0, 3 - len(axes))])
-        notes.append("its splats are discs of 2D Gaussian splatting; they are shown as very thin ellipsoids")
+    scales = sizes_of(vertices.rows(axes or ["scale_0"]), notes)
     if FILTER in vertices:
         scales, opacities = _filtered(scales, opacities, vertices.rows([FILTER]))
     harmonics = _harmonics(path, vertices, rest, notes)

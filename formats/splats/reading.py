@@ -1,7 +1,9 @@
 """Which format of splats a file has, told by its content and never by its name; and its splats."""
 
 import os
+import re
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,8 @@ from formats.splats.spz import is_spz, read_spz
 HEAD = max(MAX_HEADER, 1 << 17)
 """Bytes of a file that are looked at first."""
 MAX_JSON = 64 << 20
+MAX_FILES = 2000
+"""Point clouds of a run that are looked at."""
 GIVE = "a .ply of 3DGS, .spz, .sog, .splat, .ksplat or .glb"
 
 
@@ -38,6 +42,17 @@ def read_splats(path: Path | str) -> Splats:
         raise BadSplats(f"{path}: holds no Gaussian splats that can be read; give {GIVE}")
     with np.errstate(all="ignore"):  # numbers that are none or beyond any measure are left out, and told
         return reader(path, read_input(path, MAX_FILE))
+
+
+def newest_point_cloud(folder: Path | str) -> Path | None:
+    """The splats of the highest iteration in the folder of a run of 3DGS; None in any other."""
+    places = islice(Path(folder).glob("point_cloud/iteration_*/point_cloud.ply"), MAX_FILES)
+    steps = {
+        int(found[1]): place
+        for place in places
+        if (found := re.fullmatch(r"iteration_(\d{1,18})", place.parent.name)) and is_splats(place)
+    }
+    return steps[max(steps)] if steps else None
 
 
 @np.errstate(all="ignore")

@@ -21,6 +21,7 @@ DOWN_Y, UP_Y, UP_Z = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 ANTIALIASED = "was trained with antialiasing (Mip-Splatting's 2D filter), which is not imitated"
 SH_0 = 0.28209479177387814
 """The constant harmonic: a colour is 0.5 + SH_0 times its first coefficient."""
+DISCS = "its splats are discs of 2D Gaussian splatting; they are shown as very thin ellipsoids"
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +134,14 @@ def sigmoid(logits: np.ndarray) -> np.ndarray:
     logits = logits.astype(np.float64)
     small = np.exp(-np.abs(logits))
     return np.where(logits >= 0, 1, small) / (1 + small)
+
+
+def sizes_of(logarithms: np.ndarray, notes: list[str]) -> np.ndarray:
+    """(N, 3) float64 standard deviations of (N, 2 or 3) logarithms; the third of a disc is 0."""
+    missing = 3 - logarithms.shape[1]
+    if missing:
+        notes.append(DISCS)
+    return np.pad(np.exp(logarithms.astype(np.float64)), [(0, 0), (0, missing)])
 
 
 def coefficients_of(path: Path | str, numbers: int, notes: list[str]) -> tuple[int, int]:

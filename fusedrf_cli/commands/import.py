@@ -36,9 +36,9 @@ def command(**words):
     """Turn another system's file into a bundle of its numbers.
 
     FILE is a checkpoint of TensoRF, Plenoxels (svox2), DVGO, Instant-NGP, NeRF (nerf-pytorch), HashNeRF,
-    torch-ngp, PVD, nerfacto, K-Planes or D²NeRF, or the folder of a run, whose newest checkpoint is
-    taken; or Gaussian splats: .ply, .spz, .sog, .splat, .ksplat or glTF. Files are told apart by
-    what they hold.
+    torch-ngp, PVD, nerfacto, K-Planes, D²NeRF, 3D Gaussian splatting, splatfacto or gsplat, or the folder
+    of a run, whose newest checkpoint is taken; or Gaussian splats: .ply, .spz, .sog, .splat, .ksplat or
+    glTF. Files are told apart by what they hold.
     Nothing in them is run, and nothing is learnt.
 
     \b

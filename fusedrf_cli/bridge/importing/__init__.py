@@ -16,7 +16,7 @@ from formats.foreign.systems import SYSTEMS, Checkpoint, open_checkpoint
 from formats.graph import free_name, placement_of
 from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node
-from formats.splats.reading import is_splats
+from formats.splats.reading import is_splats, newest_point_cloud
 from formats.views import Capture
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.importing import nerf, splats
@@ -42,12 +42,17 @@ READERS = {
     "hashnerf": ("nerf", "read_hashed"),
     "k-planes": ("k_planes", "read"),
     "d2nerf": ("d2nerf", "read"),
+    "splatfacto": ("splat_checkpoints", "read_splatfacto"),
+    "gsplat": ("splat_checkpoints", "read"),
+    "3dgs": ("splat_checkpoints", "read"),
 }
 """The module and the function that read a system's checkpoint."""
 BOXLESS = "nerf-pytorch", "krrish-nerf", "hashnerf", "d2nerf"
 """Systems whose files have no box."""
 MOVING = "k-planes", "d2nerf"
 """Systems whose scenes may move."""
+SPLATS = "splatfacto", "gsplat", "3dgs"
+"""Systems whose scenes are Gaussian splats."""
 UNREAD = {
     "dmpigo": "its density is counted along the axis of a camera, and its colours depend on directions "
     "outside its space, which the file does not tell; train it with DVGO's bounded or unbounded model"
@@ -62,14 +67,16 @@ def import_field(request: ImportRequest, progress) -> dict:
     progress.phase("reading", None)
     memory = Memory(request.memory)
     capture = None if request.cameras is None else read_capture(request.cameras)
-    if Path(request.path).is_file() and is_splats(request.path):
+    newest = newest_point_cloud(request.path)
+    if newest is not None or Path(request.path).is_file() and is_splats(request.path):
         check_boxless(request)
-        system, (imported, up) = "Gaussian splats", splats.read(request.path, memory)
-        imported = replace(imported, notes=[*imported.notes, *unmoved(request)])
+        system, imported = "Gaussian splats", splats.read(newest or request.path, memory)
+        taken = [] if newest is None else [f"{request.path}: its newest splats are taken, {newest}"]
+        imported = replace(imported, notes=[*taken, *imported.notes, *unmoved(request)])
     else:
-        (system, imported), up = of_system(request, capture, memory), None
+        system, imported = of_system(request, capture, memory)
     progress.phase("writing", None)
-    graph = write(imported, request, capture, up)
+    graph = write(imported, request, capture)
     return {
         "output": request.output,
         "bytes": Path(request.output).stat().st_size,
@@ -93,7 +100,7 @@ def of_system(request: ImportRequest, capture: Capture | None, memory: Memory) -
         raise InvalidInput(f"{checkpoint.path}: a checkpoint of {title}, which is not read; {because}")
     parts = {"the field": COPIES * bytes_of(checkpoint.entries)}
     memory.expect(parts, advice="close other programs, or raise --memory")
-    imported = imported_from(checkpoint, request, capture)
+    imported = imported_from(checkpoint, request, capture, memory)
     return title, replace(imported, notes=[*checkpoint.notes, *imported.notes])
 
 
@@ -112,7 +119,9 @@ def bytes_of(entries: object) -> float:
     return float(len(entries)) if isinstance(entries, bytes) else 0.0
 
 
-def imported_from(checkpoint: Checkpoint, request: ImportRequest, capture: Capture | None) -> Imported:
+def imported_from(
+    checkpoint: Checkpoint, request: ImportRequest, capture: Capture | None, memory: Memory
+) -> Imported:
     """What the file holds. Raises InvalidInput naming the file."""
     module, function = READERS[checkpoint.system]
     read: Callable[..., Imported] = getattr(import_module(f"{__name__}.{module}"), function)
@@ -121,10 +130,12 @@ def imported_from(checkpoint: Checkpoint, request: ImportRequest, capture: Captu
         check_boxless(request)
     given = {"box": box_of(request, capture, checkpoint)} if boxless else {}
     given |= {"time": request.time} if checkpoint.system in MOVING else {}
+    given |= {"memory": memory} if checkpoint.system in SPLATS else {}
     try:
         imported = read(checkpoint, **given)
     except (FormatError, ValueError) as error:
-        raise InvalidInput(f"{checkpoint.path}: {error}") from error
+        where = "" if str(error).startswith(f"{checkpoint.path}: ") else f"{checkpoint.path}: "
+        raise InvalidInput(f"{where}{error}") from error
     notes = [] if "time" in given else unmoved(request)
     return replace(imported, notes=[*imported.notes, *notes])
 
@@ -168,11 +179,8 @@ def box_of(request: ImportRequest, capture: Capture | None, checkpoint: Checkpoi
     return np.concatenate([corners.min(0), corners.max(0)])
 
 
-def write(
-    imported: Imported, request: ImportRequest, capture: Capture | None, up: tuple[float, ...] | None
-) -> SceneGraph:
-    """Write the bundle; its scene graph: several nodes stand in a group. up: which way is up in its world,
-    where that is known."""
+def write(imported: Imported, request: ImportRequest, capture: Capture | None) -> SceneGraph:
+    """Write the bundle; its scene graph: several nodes stand in a group."""
     writer, nodes, names = BundleWriter(), [], set()
     wanted = request.name or Path(request.path).stem
     group = free_name(wanted, names) if len(imported.nodes) > 1 else None
@@ -187,8 +195,7 @@ def write(
     if capture is not None:
         unbounded = any(node.field.space is not bounded for node in imported.nodes)
         cameras = capture_camera_set(capture, surroundings=unbounded).content()
-    if request.up is not None:
-        up = tuple(unit_vector(request.up).tolist())
+    up = imported.up if request.up is None else tuple(unit_vector(request.up).tolist())
     graph = SceneGraph(tuple(nodes), generator=f"fusedrf {__version__}", cameras=cameras, up=up)
     writer.write(request.output, graph, overwrite=request.overwrite)
     return graph

@@ -42,7 +42,7 @@ def read(checkpoint) -> Imported:
     """The field of a checkpoint. Raises FormatError."""
     pipeline = Entries(checkpoint.entries).inside("pipeline")
     state, marched = (
-        state_of(pipeline),
+        state_of(pipeline, FIELD),
         any("_model.occupancy_grid." in str(name) for name in pipeline.values),
     )
     settings = Entries(model_settings(checkpoint.beside.get("config.yml")), "config.yml: ")
@@ -89,14 +89,14 @@ def read(checkpoint) -> Imported:
     return Imported([ImportedNode(field, placement)], notes + said)
 
 
-def state_of(pipeline: Entries) -> Entries:
-    """The field's entries. Runs on several GPUs have "module." in front of a name, or within."""
+def state_of(pipeline: Entries, prefix: str) -> Entries:
+    """The entries whose names begin so. Runs on several GPUs have "module." in front of a name, or within."""
     found = {}
     for name, value in pipeline.values.items():
         plain = str(name).removeprefix("module.").replace("_model.module.", "_model.", 1)
-        if plain.startswith(FIELD):
-            found[plain.removeprefix(FIELD)] = value
-    return Entries(found, FIELD)
+        if plain.startswith(prefix):
+            found[plain.removeprefix(prefix)] = value
+    return Entries(found, prefix)
 
 
 def model_settings(config: Any) -> Mapping[str, Any]:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from formats.errors import FormatError
+from formats.foreign.stored import StoredTensor
 from fusedrf_cli.engine.decoders import mlp
 from fusedrf_cli.engine.decoders.sh_mlp import HARMONICS
 from fusedrf_cli.engine.fields.base import check_samples, sampling_step
@@ -42,6 +43,8 @@ class Imported:
     """Sentences about what was chosen, or could not be taken over."""
     rule: str = "max"
     """By which several nodes are composed."""
+    up: tuple[float, ...] | None = None
+    """The direction that is up in its world, where that is known not to be +z."""
 
 
 class Entries:
@@ -73,16 +76,26 @@ class Entries:
         except ValueError:
             return np.asarray(None)
 
-    def array(self, name: str, *shape: int | None) -> np.ndarray:
-        """An array as float32, or float64 where it is that; of a shape, None for any size."""
+    def numbers(self, name: str, *shape: int | None) -> np.ndarray:
+        """An array as float32, or float64 where it is that, also with NaN; of a shape, None for any size,
+        which a file's own array is asked before it is read."""
+        if isinstance(self.get(name), StoredTensor):
+            self._check_shape(name, self.get(name).shape, shape)
         value = self.values_of(name)
         if value.dtype.kind not in "fiub":
             raise FormatError(f"{self.where}'{name}' should hold numbers")
-        found, fits = value.shape, not shape or len(shape) == value.ndim
+        self._check_shape(name, value.shape, shape)
+        return value if value.dtype == np.float64 else value.astype(np.float32, copy=False)
+
+    def _check_shape(self, name: str, found: tuple[int, ...], shape: tuple[int | None, ...]) -> None:
+        fits = not shape or len(shape) == len(found)
         if not fits or any(n not in (None, m) for n, m in zip(shape, found, strict=False)):
-            expected = [n or "any" for n in shape]
+            expected = ["any" if n is None else n for n in shape]
             raise FormatError(f"{self.where}'{name}' should have shape {expected}, found {list(found)}")
-        value = value if value.dtype == np.float64 else value.astype(np.float32, copy=False)
+
+    def array(self, name: str, *shape: int | None) -> np.ndarray:
+        """Finite numbers, otherwise as `numbers` gives them."""
+        value = self.numbers(name, *shape)
         if not np.isfinite(value).all():
             raise FormatError(f"{self.where}'{name}' holds NaN or infinity")
         return value

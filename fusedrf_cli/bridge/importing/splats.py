@@ -1,5 +1,8 @@
 """Gaussian splats (Kerbl et al. 2023) of any format that formats/splats reads."""
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 
 from formats.splats.reading import read_splats
@@ -22,27 +25,38 @@ WIDER = 2.5
 the surroundings, would be too coarse for the others."""
 
 
-def read(path: str, memory: Memory) -> tuple[Imported, tuple[float, ...] | None]:
-    """The fields of a file, and which way is up in it where that is not +z. Raises FormatError."""
+def read(path: Path | str, memory: Memory) -> Imported:
+    """The fields of a file. Raises FormatError."""
     splats = read_splats(path)
     if not len(splats):
         raise InvalidInput(f"{path}: holds no splats")
+    return fields_of(splats, memory, notes=[f"it is {splats.kind}"])
+
+
+def fields_of(
+    splats: Splats, memory: Memory, placement: np.ndarray | None = None, notes: Sequence[str] = ()
+) -> Imported:
+    """The fields of splats, which `placement` (4, 4) puts into the world that `splats.up` is of."""
     memory.expect(
         {f"{len(splats):,} splats": float(PER_SPLAT * len(splats))},
         advice="close other programs, or raise --memory",
     )
     shells = shells_of(boxes_around(splats))
     nodes = [
-        ImportedNode(field_of(splats, shell), suffix=f"-{i + 1}" if len(shells) > 1 else "")
+        ImportedNode(
+            field_of(splats, shell),
+            np.eye(4) if placement is None else placement,
+            suffix=f"-{i + 1}" if len(shells) > 1 else "",
+        )
         for i, shell in enumerate(shells)
     ]
-    notes = [f"it is {splats.kind}", *splats.notes]
+    notes = [*notes, *splats.notes]
     if len(shells) > 1:
         counts = ", ".join(f"{len(shell):,}" for shell in shells)
         notes.append(
             f"it becomes {len(shells)} fields that add up, from the middle outwards: {counts} splats"
         )
-    return Imported(nodes, notes, "add"), None if splats.up == UP_Z else splats.up
+    return Imported(nodes, notes, "add", None if splats.up == UP_Z else splats.up)
 
 
 def field_of(splats: Splats, index: np.ndarray) -> SplatsField:

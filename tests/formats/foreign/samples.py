@@ -65,7 +65,14 @@ def hash_model(levels: int) -> dict:
     return {"epoch": 1, "model": state(*names) | {"encoder.offsets": torch.arange(levels + 1)}}
 
 
-TORCH: dict[str, tuple[str, dict]] = {
+GAUSSIANS = {
+    "means": weights(5, 3),
+    "scales": weights(5, 3),
+    "quats": weights(5, 4),
+    "opacities": weights(5, 1),
+}
+REST = weights(5, 3, 3)
+TORCH: dict[str, tuple[str, object]] = {
     "tensorf": (
         "lego.th",
         {
@@ -107,6 +114,27 @@ TORCH: dict[str, tuple[str, dict]] = {
             ),
         },
     ),
+    "splatfacto": (
+        "nerfstudio_models/step-000029999.ckpt",
+        {
+            "step": 29999,
+            "pipeline": {f"_model.gauss_params.{name}": value for name, value in GAUSSIANS.items()}
+            | {"_model.gauss_params.features_dc": weights(5, 3), "_model.gauss_params.features_rest": REST},
+        },
+    ),
+    "gsplat": (
+        "ckpts/ckpt_29999_rank0.pt",
+        {"step": 29999, "splats": GAUSSIANS | {"sh0": weights(5, 1, 3), "shN": REST}},
+    ),
+    "3dgs": (
+        "chkpnt30000.pth",
+        (
+            (1, GAUSSIANS["means"], weights(5, 1, 3), REST)
+            + (GAUSSIANS["scales"], GAUSSIANS["quats"], GAUSSIANS["opacities"])
+            + (weights(5), weights(5, 1), weights(5, 1), {"state": {}, "param_groups": [{"lr": 0.1}]}, 2.5),
+            30000,
+        ),
+    ),
     "k-planes": (
         "model.pth",
         {"model": state("field.grids.0.0", "field.sigma_net.params"), "lr_scheduler": None},
@@ -130,11 +158,14 @@ pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConf
     - 96
     - 64
 """
+NERFSTUDIO = {
+    "config.yml": CONFIG,
+    "dataparser_transforms.json": '{"transform": [[1, 0, 0, 0]], "scale": 0.5}',
+}
 BESIDE = {
-    "nerfacto": {
-        "config.yml": CONFIG,
-        "dataparser_transforms.json": '{"transform": [[1, 0, 0, 0]], "scale": 0.5}',
-    },
+    "nerfacto": NERFSTUDIO,
+    "splatfacto": NERFSTUDIO,
+    "gsplat": {"cfg.yml": "normalize_world_space: true\nbilateral_grid_shape: !!python/tuple\n- 16\n- 8\n"},
     "nerf-pytorch": {"args.txt": "multires = 10\ndatadir = ./data/a=b\nft_path = None\nwhite_bkgd = True\n"},
     "k-planes": {
         "config.py": "import os\nconfig = {'density_activation': 'trunc_exp', 'reso': [1, 2], 'a': -1}\n"

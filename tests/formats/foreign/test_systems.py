@@ -81,6 +81,13 @@ def test_a_folder_is_its_newest_checkpoint(tmp_path):
     assert checkpoint.path.name == "001000.tar" and "001000.tar is taken" in checkpoint.notes[0]
 
 
+def test_a_folder_of_gsplat_is_its_last_step_of_all_gpus(tmp_path):
+    path = write("gsplat", tmp_path)
+    for name in ("ckpt_6999_rank0.pt", "ckpt_29999_rank1.pt", "ckpt_29999_rank12.pt"):
+        shutil.copy(path, path.with_name(name))
+    assert open_checkpoint(tmp_path).path == path
+
+
 def test_a_folder_of_dvgo_is_its_last_fine_checkpoint(tmp_path):
     write("dvgo", tmp_path)
     for name in ("coarse_last.tar", "fine_020000.tar"):
@@ -157,6 +164,8 @@ def test_other_files_are_named(name, data, said, tmp_path):
         ({"pipeline": state("_model.gauss_params.means")}, "_model.gauss_params.means"),
         ({"model": hash_model(16)["model"] | state("deform_net.0.weight")}, "encoder.embeddings"),
         (({"a": weights(2)}, 30_000), "holds tuple"),
+        (((3, *[weights(5, 3)] * 11), 30_000), "holds gaussians, iteration"),
+        (((3, weights(5, 3), {"a": weights(2)}), 30_000), "holds tuple"),
         ({}, "is empty"),
         ({str(n): n for n in range(1000)}, "and 992 more"),
     ],
