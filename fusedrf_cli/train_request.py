@@ -17,7 +17,8 @@ class TrainRequest(Writing, Learning, Sizing):
     output: str
     _: KW_ONLY
     kind: str | None = None
-    """None: hash of surroundings, else vm, or of fields that share a decoder dense-mlp."""
+    """None: hash of surroundings that learn for three minutes or more, else vm, or of fields that share a
+    decoder dense-mlp."""
     shared_decoder: bool = False
     quality: Literal["draft", "normal", "high", "best"] | None = None
     """None: as the time budget allows."""

@@ -185,7 +185,7 @@ def learnt_from(
     capture = posed_as(posed_capture(request.refit, None, request.threads, progress), frame, progress)
     bounds = bounds_like(frame, capture)
     train_request = default_training(request)
-    kind = trained_kind(train_request, bounds.unbounded)
+    kind = trained_kind(train_request, bounds.unbounded, device)
     settings = fit_settings(train_request, kind, capture, bounds, device)
     plan = kind.untrained(bounds.box, settings.longest, settings.storage)
     memory.expect(fit_memory(capture, plan, settings), advice="give fewer or smaller photos")

@@ -136,7 +136,7 @@ def train(request: TrainRequest, progress) -> dict:
         trained_kind(request)  # before anything is read
         progress.phase("reading", None)
         sources = read_sources(request, progress)
-        kind = trained_kind(request, any(source.bounds.unbounded for source in sources))
+        kind = trained_kind(request, any(source.bounds.unbounded for source in sources), device)
         plan(request, kind, sources, memory, device)
         for source in sources:
             source.begin()

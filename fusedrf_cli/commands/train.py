@@ -20,7 +20,8 @@ from fusedrf_cli.requests import TrainRequest
 @click.option(
     "--kind",
     type=FieldKindType(),
-    help="Kind of field; default: hash of surroundings, else vm; with --shared-decoder dense-mlp.",
+    help="Kind of field; default: vm, of surroundings that learn for 3 minutes or more hash, with "
+    "--shared-decoder dense-mlp.",
 )
 @click.option(
     "--shared-decoder",

@@ -17,6 +17,7 @@ from formats.graph import free_name, placement_of
 from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node
 from formats.splats.reading import is_splats, newest_point_cloud
+from formats.splats.splats import UP_Z
 from formats.views import Capture
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.importing import nerf, splats
@@ -195,7 +196,8 @@ def write(imported: Imported, request: ImportRequest, capture: Capture | None) -
     if capture is not None:
         unbounded = any(node.field.space is not bounded for node in imported.nodes)
         cameras = capture_camera_set(capture, surroundings=unbounded).content()
-    up = imported.up if request.up is None else tuple(unit_vector(request.up).tolist())
+    up = None if imported.up == UP_Z else imported.up
+    up = up if request.up is None else tuple(unit_vector(request.up).tolist())
     graph = SceneGraph(tuple(nodes), generator=f"fusedrf {__version__}", cameras=cameras, up=up)
     writer.write(request.output, graph, overwrite=request.overwrite)
     return graph

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from formats.errors import FormatError
+from formats.splats.splats import UP_Z
 from fusedrf_cli.bridge.importing import tcnn
 from fusedrf_cli.bridge.importing.parts import (
     ColourInput,
@@ -86,7 +87,7 @@ def read(checkpoint) -> Imported:
     placement, said = placement_of(checkpoint.beside.get("dataparser_transforms.json"))
     if codes is not None:
         said.append(f"its appearance codes are fixed to {'their mean' if codes.any() else '0'}")
-    return Imported([ImportedNode(field, placement)], notes + said)
+    return Imported([ImportedNode(field, placement)], notes + said, up=up_of(placement))
 
 
 def state_of(pipeline: Entries, prefix: str) -> Entries:
@@ -275,3 +276,9 @@ def placement_of(transforms: Any) -> tuple[np.ndarray, list[str]]:
         raise FormatError("dataparser_transforms.json: the transform cannot be undone")
     notes.append("it lies where its capture does: dataparser_transforms.json is undone")
     return np.linalg.inv(forward), notes
+
+
+def up_of(placement: np.ndarray) -> tuple[float, ...]:
+    """(3,) which way of the capture is up: +z of the model, by how its cameras were held."""
+    up = placement[:3, :3] @ UP_Z
+    return tuple((up / np.linalg.norm(up)).round(9).tolist())

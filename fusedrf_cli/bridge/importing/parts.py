@@ -11,6 +11,7 @@ import torch
 
 from formats.errors import FormatError
 from formats.foreign.stored import StoredTensor
+from formats.splats.splats import UP_Z
 from fusedrf_cli.engine.decoders import mlp
 from fusedrf_cli.engine.decoders.sh_mlp import HARMONICS
 from fusedrf_cli.engine.fields.base import check_samples, sampling_step
@@ -43,8 +44,8 @@ class Imported:
     """Sentences about what was chosen, or could not be taken over."""
     rule: str = "max"
     """By which several nodes are composed."""
-    up: tuple[float, ...] | None = None
-    """The direction that is up in its world, where that is known not to be +z."""
+    up: tuple[float, ...] = UP_Z
+    """(3,) which way of its world is up."""
 
 
 class Entries:

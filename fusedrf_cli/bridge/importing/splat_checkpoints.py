@@ -26,7 +26,7 @@ from formats.splats.splats import (
     sigmoid,
     sizes_of,
 )
-from fusedrf_cli.bridge.importing.nerfacto import model_settings, placement_of, state_of
+from fusedrf_cli.bridge.importing.nerfacto import model_settings, placement_of, state_of, up_of
 from fusedrf_cli.bridge.importing.parts import Entries, Imported
 from fusedrf_cli.bridge.importing.splats import fields_of
 from fusedrf_cli.bridge.memory import Memory
@@ -85,9 +85,7 @@ def read(checkpoint: Checkpoint, memory: Memory) -> Imported:
 def read_splatfacto(checkpoint: Checkpoint, memory: Memory) -> Imported:
     """The fields of splatfacto's splats, where their capture lies. Raises FormatError."""
     placement, said = placement_of(checkpoint.beside.get("dataparser_transforms.json"))
-    up = placement[:3, :3] @ UP_Z
-    up = tuple((up / np.linalg.norm(up)).round(9).tolist())
-    return fields_of(of_splatfacto(checkpoint, up), memory, placement, said)
+    return fields_of(of_splatfacto(checkpoint, up_of(placement)), memory, placement, said)
 
 
 # -- what each trainer holds ---------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.splats.reading import read_splats
-from formats.splats.splats import UP_Z, Splats
+from formats.splats.splats import Splats
 from fusedrf_cli.bridge.importing.parts import Imported, ImportedNode
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.engine.kinds.splats.device_functions import REACH
@@ -56,7 +56,7 @@ def fields_of(
         notes.append(
             f"it becomes {len(shells)} fields that add up, from the middle outwards: {counts} splats"
         )
-    return Imported(nodes, notes, "add", None if splats.up == UP_Z else splats.up)
+    return Imported(nodes, notes, "add", splats.up)
 
 
 def field_of(splats: Splats, index: np.ndarray) -> SplatsField:

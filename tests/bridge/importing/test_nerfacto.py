@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from formats.bundle import read_summary
 from formats.foreign.systems import open_checkpoint
 from fusedrf_cli import verbs
 from fusedrf_cli.bridge.importing import nerfacto
@@ -70,7 +71,9 @@ RUNS = {
 BOX = np.array([[-1.0, -1.5, -0.5], [1.5, 1.0, 1.0]], np.float32)
 SCALE, TURN = 0.4, 0.7
 SHIFT = np.array([0.3, -0.2, 0.1])
-FRAME = np.array([[math.cos(TURN), -math.sin(TURN), 0], [math.sin(TURN), math.cos(TURN), 0], [0, 0, 1]])
+FRAME = np.array([[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]]) @ np.array(
+    [[math.cos(TURN), -math.sin(TURN), 0], [math.sin(TURN), math.cos(TURN), 0], [0, 0, 1]]
+)
 
 
 def padded(count: int, by: int) -> int:
@@ -269,6 +272,8 @@ def test_the_command_writes_it(tmp_path):
     written(run, tmp_path)
     report = verbs.import_field(tmp_path, output=tmp_path / "f.rfpack", name="room")
     assert [entry["name"] for entry in report["fields"]] == ["room"]
+    up = read_summary(tmp_path / "f.rfpack")["up"]  # which its trainer turned to +z
+    assert up == pytest.approx(FRAME.T @ [0, 0, 1])
     points, d = places(run, 50)
     oracle.assert_alike(oracle.asked(tmp_path / "f.rfpack", points, d), expected(run, points, d), 1e-3)
 

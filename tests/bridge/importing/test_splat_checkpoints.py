@@ -214,13 +214,13 @@ def test_splatfacto_lies_where_its_capture_does(tmp_path):
 
 def test_without_its_transforms_it_stays_where_it_was_learnt(tmp_path):
     imported, _ = read(save_splatfacto(tmp_path, content()))
-    assert (imported.nodes[0].object_to_world == np.eye(4)).all() and imported.up is None
+    assert (imported.nodes[0].object_to_world == np.eye(4)).all() and imported.up == limits.UP_Z
     assert "no dataparser_transforms.json" in " ".join(imported.notes)
 
 
 def test_what_gsplat_says_of_its_world(tmp_path):
     imported, _ = read(save_gsplat(tmp_path, content()))
-    assert imported.up is None and "keeps no word of how" in " ".join(imported.notes)
+    assert imported.up == limits.UP_Z and "keeps no word of how" in " ".join(imported.notes)
     imported, _ = read(save_gsplat(tmp_path, content(), settings={"cfg.yml": "normalize_world_space: false"}))
     assert imported.up == (0, -1, 0) and not imported.notes
     assert read(save_3dgs(tmp_path, content()))[0].up == (0, -1, 0)
