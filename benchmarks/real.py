@@ -54,7 +54,8 @@ QUALITY = 80
 """Of JPEG: some 20 kB a picture."""
 ABOUT = (
     "Written by `make bench-real`; rows that a run leaves out stay, each with its *commit*. "
-    f"Every {EVERY}th photo is held out. PSNR is the mean over those photos, "
+    f"Every {EVERY}th photo is held out; *kind* is what `train` takes for so many minutes. "
+    "PSNR is the mean over those photos, "
     "in the pixels that masks keep; *corrected* is after the affine map of colours that suits each photo "
     "best, which the photo itself tells; *gap* is the training PSNR less the held-out one; *mean colour* and "
     "*nearest photo* are what the mean colour of the training photos and a copy of the nearest one reach. "
@@ -92,6 +93,7 @@ def measured(folder: Path, name: str, capture: Capture, seconds: float, field: P
         "photos": f"{report['views']} of {report['capture']['photos']}",
         "poses": report["capture"]["kind"],
         "space": report["space"],
+        "kind": report["kind"],
         "minutes": seconds / 60,
         "steps": report["steps"],
         "PSNR": held["psnr"],

@@ -17,7 +17,7 @@ class TrainRequest(Writing, Learning, Sizing):
     output: str
     _: KW_ONLY
     kind: str | None = None
-    """None: hash of surroundings that learn for three minutes or more, else vm, or of fields that share a
+    """None: hash of surroundings that learn for two minutes or more, else vm, or of fields that share a
     decoder dense-mlp."""
     shared_decoder: bool = False
     quality: Literal["draft", "normal", "high", "best"] | None = None

@@ -57,7 +57,7 @@ class TrainPresets:
     largest_unbounded: int = 95_000_000
     """Bytes, stored as its kind is by default, where no size is asked for: voxels of all of space, as fine as
     planes are, would take a hundred times those of the planes."""
-    surroundings_from: float = 180.0
+    surroundings_from: float = 120.0
     """Seconds of learning from which surroundings are learnt as `registry.SURROUNDINGS`: after thirty seconds
     of a fox planes and lines show 3 dB more, after two minutes as much, after five of a fern 1 dB less."""
     hashed: HashGrid = HashGrid((2 * REACH / 256, 2 * REACH / 512, 2 * REACH / 1024), 1 << 20)

@@ -20,7 +20,7 @@ from fusedrf_cli.requests import TrainRequest
 @click.option(
     "--kind",
     type=FieldKindType(),
-    help="Kind of field; default: vm, of surroundings that learn for 3 minutes or more hash, with "
+    help="Kind of field; default: vm, of surroundings that learn for 2 minutes or more hash, with "
     "--shared-decoder dense-mlp.",
 )
 @click.option(
