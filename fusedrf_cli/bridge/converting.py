@@ -1,15 +1,29 @@
 """`convert`: a field of any kind to one of any other."""
 
-from dataclasses import fields
+from contextlib import nullcontext
+from dataclasses import dataclass, fields, replace
 
 from formats.bundle import OpenBundle, is_bundle
 from fusedrf_cli.bridge.evaluating import evaluate
-from fusedrf_cli.bridge.fusing import fuse
+from fusedrf_cli.bridge.fusing import FusingConfig, fuse
 from fusedrf_cli.bridge.scene import unusable_kind
 from fusedrf_cli.bridge.sources import scene_as_stored
 from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.box_kind import BoxKindConfig
+from fusedrf_cli.engine.settings import current, using
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import ConvertRequest, EvaluateRequest, FuseRequest
+
+
+@dataclass(frozen=True)
+class ConvertingConfig:
+    """How large a field on vertices gets where no size is asked for: as fine as one that is trained. With
+    what a fuse allows, a chair of 256 texels would have 194."""
+
+    max_size: int = 50_000_000
+    """Bytes, beside what the places among the sources take."""
+    most_held: int = 150_000_000
+    """Numbers in memory: with what learning adds, some 4 GB."""
 
 
 def convert(request: ConvertRequest, progress) -> dict:
@@ -24,11 +38,14 @@ def convert(request: ConvertRequest, progress) -> dict:
         raise UsageProblem(f"--kind {request.kind} is a way of fusing and no kind of field; choose another")
     same = [field.name for field in fields(FuseRequest) if hasattr(request, field.name)]
     words = {name: getattr(request, name) for name in same}
-    fused = fuse(
-        FuseRequest(scene=request.field, from_scratch=True, **words),
-        progress,
-        load=scene_as_stored,
+    config = current(ConvertingConfig)
+    larger = using(
+        replace(current(FusingConfig), default_max_size=config.max_size),
+        replace(current(BoxKindConfig), most_held=config.most_held),
     )
+    with larger if target_kind.on_vertices and request.max_size is None else nullcontext():
+        fuse_request = FuseRequest(scene=request.field, from_scratch=True, **words)
+        fused = fuse(fuse_request, progress, load=scene_as_stored)
     progress.phase("comparing", None)
     compared = evaluate(
         EvaluateRequest(

@@ -45,6 +45,11 @@ class BoxKind(Kind):
         return self.takes & {"sh_degree"}
 
     @property
+    def on_vertices(self) -> bool:
+        """See Kind."""
+        return any(part.on_vertices for part in self.field.parts_of(self.usual, (2, 2, 2)))
+
+    @property
     def usual(self) -> object:
         """The field's shape where nothing is asked."""
         return self.field.shape_type()
@@ -73,9 +78,7 @@ class BoxKind(Kind):
 
     def builder(self, scene: ComposedField, request: BuildRequest) -> DistilledBuilder:
         """See Kind."""
-        parts = self.field.parts_of(self.shape(StorageSetting()), (2, 2, 2))
-        on_vertices = any(part.on_vertices for part in parts)
-        return (GridBuilder if on_vertices else DistilledBuilder)(self, scene, request)
+        return (GridBuilder if self.on_vertices else DistilledBuilder)(self, scene, request)
 
     def reduction(self, outline: BoxField, voxel: float, storage: StorageSetting) -> Reduction:
         """See Kind: fewer texels, and SH bands where the kind has them."""
