@@ -19,7 +19,7 @@ from formats.scene import SceneGraph, make_node
 from formats.splats.reading import is_splats
 from formats.views import Capture
 from fusedrf_cli import __version__
-from fusedrf_cli.bridge.importing import nerf, splats
+from fusedrf_cli.bridge.importing import dvgo, nerf, splats
 from fusedrf_cli.bridge.importing.parts import Imported
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.views import unit_vector
@@ -48,10 +48,7 @@ BOXLESS = "nerf-pytorch", "krrish-nerf", "hashnerf", "d2nerf"
 """Systems whose files have no box."""
 MOVING = "k-planes", "d2nerf"
 """Systems whose scenes may move."""
-UNREAD = {
-    "dmpigo": "its density is counted along the axis of a camera, and its colours depend on directions "
-    "outside its space, which the file does not tell; train it with DVGO's bounded or unbounded model"
-}
+UNREAD = {"dmpigo": dvgo.FORWARD}
 """Why checkpoints of a system are not read, where that is known."""
 COPIES = 5.5
 """Of an array, of what its field takes: read, rearranged, as numbers and as they are written."""

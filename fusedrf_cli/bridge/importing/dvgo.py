@@ -1,6 +1,5 @@
 """DVGO's checkpoints (Sun et al., CVPR 2022, and its second version; github.com/sunset1995/DirectVoxGO):
-DirectVoxGO and DirectContractedVoxGO, on dense or TensoRF grids, and those of earlier versions, but for
-colours that depend on the point beside the grid."""
+DirectVoxGO and DirectContractedVoxGO, on dense or TensoRF grids, and those of earlier versions."""
 
 import numpy as np
 
@@ -24,12 +23,17 @@ from fusedrf_cli.engine.kinds.assembled.field import PartsShape
 from fusedrf_cli.engine.spaces import bounded, contracted_l2, contracted_linf, space_of
 
 NORM = "it does not say by which norm it is contracted, so 'inf' is taken; earlier versions had 'l2'"
-MASK = "of the coarse densities that mask it, only at which vertices they do is in the file"
+MASK = "the coarse densities that mask it are asked at its vertices, and not between them"
 MODES = (("xy", "z", 0, 1, 2), ("xz", "y", 0, 2, 1), ("yz", "x", 1, 2, 0))
 
 
 OTHERWISE = "nearest", "pre_act_density", "in_act_density"
 """Options of the first version by which a grid is read otherwise."""
+FORWARD = (
+    "its density is counted along the axis of a camera, and its colours depend on directions outside its "
+    "space, which the file does not tell; train it with DVGO's bounded or unbounded model"
+)
+"""Why DirectMPIGO's checkpoints are not read."""
 
 
 def read(checkpoint) -> Imported:
@@ -45,6 +49,8 @@ def read(checkpoint) -> Imported:
         raise FormatError(f"grids of density and colour are of {resolution} and {colour_resolution} vertices")
     values |= more
     count = len(basis) if basis is not None else state.get(dense_name(state, "k0")).shape[1]
+    if "posfreq" in state.values:
+        colour, values = with_points(values)
     rgb, shading = shading_of(kwargs, state, count, basis)
     shape = PartsShape(density, colour, {"part": "density_sum"}, rgb)
     space, placement, notes = space_and_placement(kwargs, state, box)
@@ -57,13 +63,10 @@ def read(checkpoint) -> Imported:
 
 
 def check_version(kwargs: Entries, state: Entries) -> None:
-    """Refuse what only the first version does. Raises FormatError."""
-    said = [name for name in OTHERWISE if kwargs.values.get(name)]
-    if "posfreq" in state.values:
-        said.append("posbase_pe")  # colours that read the point as well
-    if kwargs.values.get("rgbnet_full_implicit"):
-        said.append("rgbnet_full_implicit")  # colours that read no grid
-    if said:
+    """Refuse what is read otherwise. Raises FormatError."""
+    if "mpi_depth" in kwargs.values:  # which its later version is told by before it is opened
+        raise FormatError(f"a checkpoint of DVGO (NDC), which is not read; {FORWARD}")
+    if said := [name for name in OTHERWISE if kwargs.values.get(name)]:
         raise FormatError(
             f"model_kwargs: '{said[0]}' of DVGO's first version is not taken over; train it with the second"
         )
@@ -117,6 +120,17 @@ def grid_of(state: Entries, which: str) -> tuple[dict, dict[str, np.ndarray], tu
     return {"part": "plane_line", "rank": rank}, made, resolution, basis
 
 
+def with_points(values: dict[str, np.ndarray]) -> tuple[dict, dict[str, np.ndarray]]:
+    """The entry of the colours' grid and all sections, with three more numbers at a vertex: where in the box
+    it lies, from 0 to 1. Interpolated, that is where a point lies."""
+    if "colour_" not in values:
+        raise FormatError("colours of a TensoRF grid should not read the point, found 'posfreq'")
+    rows = values["colour_"]
+    axes = np.meshgrid(*(np.linspace(0, 1, n, dtype=np.float32) for n in rows.shape[:3]), indexing="ij")
+    rows = np.concatenate([rows, np.stack(axes, -1)], -1)
+    return {"part": "grid", "numbers": rows.shape[-1]}, values | {"colour_": rows}
+
+
 def shading_of(
     kwargs: Entries, state: Entries, count: int, basis: np.ndarray | None
 ) -> tuple[dict, dict[str, np.ndarray]]:
@@ -128,21 +142,32 @@ def shading_of(
         if basis is None:
             return {"part": "rgb"}, {}
         return {"part": "sh_basis", "coefficients": 1}, {"rgb_basis": basis[:, None] / Y0}
-    frequencies = kwargs.whole("viewbase_pe", 0, 16, 4)
-    if "viewfreq" in state.values:
-        bands = state.array("viewfreq", None)
-        frequencies = len(bands)
-        if not np.array_equal(bands, 2.0 ** np.arange(frequencies)):
-            raise FormatError(f"'viewfreq' should be 1, 2, 4 and so on, found {bands.tolist()[:9]}")
     layers = state.layers("rgbnet.")
+    views = frequencies_of(state, "viewfreq", kwargs.whole("viewbase_pe", 0, 16, 4))
+    points = frequencies_of(state, "posfreq", 0)
+    rows, at = count if basis is not None else 0, 3 * ("posfreq" in state.values)
     # not all versions say whether the first three features are diffuse; the first layer's width does
-    direct = layers[0][0].shape[1] == count + 3 + 6 * frequencies
-    rows = count if basis is not None else 0
-    order = ColourInput(count, rows or eight(count), frequencies, alone=True)
-    read = order.at("features")[0 if direct else 3 :]
-    columns = np.concatenate([read, order.at("direction"), order.waves("direction", frequencies)])
+    direct = layers[0][0].shape[1] == count + at * (1 + 2 * points) + 3 + 6 * views
+    order = ColourInput(count + at, rows or eight(count + at), max(views, points), alone=not points)
+    columns = [
+        order.at("features")[0 if direct else 3 :],
+        order.waves("features", points).reshape(2, count + at, points)[:, count:].reshape(-1),
+        order.at("direction"),
+        order.waves("direction", views),
+    ]
+    columns = np.concatenate(columns)
     entry, sections = colour_network(layers, order, columns, rows=rows, diffuse=not direct)
     return entry, sections | own
+
+
+def frequencies_of(state: Entries, name: str, otherwise: int) -> int:
+    """How many there are of an encoding; otherwise: where the file has none of this name."""
+    if name not in state.values:
+        return otherwise
+    bands = state.array(name, None)
+    if not np.array_equal(bands, 2.0 ** np.arange(len(bands))):
+        raise FormatError(f"'{name}' should be 1, 2, 4 and so on, found {bands.tolist()[:9]}")
+    return len(bands)
 
 
 def space_and_placement(kwargs: Entries, state: Entries, box: np.ndarray):
