@@ -241,6 +241,7 @@ SYSTEMS = {  # the first whose rule fits counts
         "model/encoder.embeddings:* model/encoder.offsets:15 model/sigma_net.0.weight:* !model/deform_net.*"
         "| model/nerf_mlp.0.weight:* model/sigma_net.0.weight:* | model/tensor_volume.0:*"
         "| model/sigma_mat.0:* model/color_mat.0:* model/basis_mat.weight:15x*",
+        ("args.txt",),
     ),
     "torch-ngp": System(  # but for its networks of moving scenes
         "torch-ngp",

@@ -44,8 +44,8 @@ FRAME = (
 )
 EMA = "its moving averages (ema) are left out, as the system's own rendering does"
 RECIPE = (
-    "what it exponentiates, and colour features of planes, are taken to be kept between -2 and 7, as PVD's "
-    "options do by default"
+    "no args.txt lies beside it: what it exponentiates, and colour features of planes, are taken to be kept "
+    "between -2 and 7, as PVD does by default where it distills"
 )
 
 
@@ -53,22 +53,43 @@ def read(checkpoint) -> Imported:
     """The field of a checkpoint of torch-ngp. Raises FormatError."""
     model = Entries(checkpoint.entries).inside("model")
     if "basis_mat.weight" in model.values:
-        return planes(checkpoint, model, "waves", EXPONENTS)
+        return planes(checkpoint, model, "waves", EXPONENTS, None)
     return hashed(checkpoint, model, EXPONENTS)
 
 
 def read_pvd(checkpoint) -> Imported:
     """The field of a checkpoint of PVD. Raises FormatError."""
     model = Entries(checkpoint.entries).inside("model")
+    settings = checkpoint.beside.get("args.txt")
+    limits, of_colours = limits_of(Entries(settings or {}, "args.txt: "))
     if "encoder.embeddings" in model.values:
-        made = hashed(checkpoint, model, LIMITS)
+        made = hashed(checkpoint, model, limits)
     elif "tensor_volume.0" in model.values:
-        made = volume(checkpoint, model)
+        made = volume(checkpoint, model, of_planes(settings, limits))
     elif "sigma_mat.0" in model.values:
-        made = planes(checkpoint, model, "harmonics", LIMITS)
+        made = planes(checkpoint, model, "harmonics", of_planes(settings, limits), of_colours)
     else:
-        made = network(checkpoint, model)
-    return replace(made, notes=[*made.notes, RECIPE])
+        made = network(checkpoint, model, limits)
+    return made if settings else replace(made, notes=[*made.notes, RECIPE])
+
+
+def limits_of(settings: Entries) -> tuple[tuple[float, float], tuple[float, float] | None]:
+    """Between which PVD keeps what it exponentiates, and the colour features of planes: those of a model that
+    was learnt from photos as they are."""
+    limits = tuple(
+        settings.number(f"sigma_clip_{end}", default)
+        for end, default in zip(("min", "max"), LIMITS, strict=True)
+    )
+    if not limits[0] < limits[1]:
+        raise FormatError(f"args.txt: 'sigma_clip_min' should be below 'sigma_clip_max', found {limits}")
+    kept = max(limits[0], EXPONENTS[0]), min(limits[1], EXPONENTS[1])
+    return kept, None if settings.values.get("just_train_a_model") else limits
+
+
+def of_planes(settings: dict | None, limits: tuple[float, float]) -> tuple[float, float]:
+    """What is exponentiated of planes and volumes: of edited ones as little as there may be."""
+    edited = (settings or {}).get("enable_edit_plenoxel")
+    return (EXPONENTS[0], limits[1]) if edited else limits
 
 
 def hashed(checkpoint, model: Entries, limits: tuple[float, float]) -> Imported:
@@ -110,9 +131,12 @@ def halves(model: Entries, name: str) -> np.ndarray:
     return model.array(name, None).astype(np.float16).astype(np.float32)
 
 
-def planes(checkpoint, model: Entries, seen: str, limits: tuple[float, float]) -> Imported:
+def planes(
+    checkpoint, model: Entries, seen: str, limits: tuple[float, float], of_colours: tuple[float, float] | None
+) -> Imported:
     """Planes and lines, or lines alone, and a colour network of what a matrix makes of them and of the
-    direction, `seen` as "harmonics" (PVD) or with "waves" of both (torch-ngp's TensoRF)."""
+    direction, `seen` as "harmonics" (PVD) or with "waves" of both (torch-ngp's TensoRF). Between limits are
+    kept what is exponentiated, and the features of colours."""
     crossed = "sigma_mat.0" in model.values
     density, resolution, _ = factors(model, "sigma", crossed)
     colour, colour_resolution, ranks = factors(model, "color", crossed)
@@ -147,12 +171,12 @@ def planes(checkpoint, model: Entries, seen: str, limits: tuple[float, float]) -
     part = "plane_line" if crossed else "line"
     encodings = [{"part": part, "rank": made["line_0"].shape[-1]} for made in (density, colour)]
     sigma = {"part": "density_sum", "activation": "exp", "limits": list(limits)}
-    rgb |= {"limits": list(limits)} if seen == "harmonics" else {}
+    rgb |= {} if of_colours is None else {"limits": list(of_colours)}
     shape = PartsShape(*encodings, sigma, rgb)
     return finished(checkpoint, model, shape, box, resolution, values)
 
 
-def volume(checkpoint, model: Entries) -> Imported:
+def volume(checkpoint, model: Entries, limits: tuple[float, float]) -> Imported:
     """A grid of density and spherical harmonics."""
     grid = model.array("tensor_volume.0", 1, None, None, None, None)[0].transpose(3, 2, 1, 0)
     coefficients, rest = divmod(grid.shape[-1] - 1, 3)
@@ -162,7 +186,7 @@ def volume(checkpoint, model: Entries) -> Imported:
         )
     shape = PartsShape(
         {"part": "grid", "numbers": 1}, {"part": "grid", "numbers": 3 * coefficients},
-        {"part": "density_sum", "activation": "exp", "limits": LIMITS},
+        {"part": "density_sum", "activation": "exp", "limits": list(limits)},
         {"part": "sh", "coefficients": coefficients},
     )  # fmt: skip
     box, around = with_zeros(box_of(model, "aabb_train"), grid.shape[:3], cube_of(bound_of(model)))
@@ -171,14 +195,14 @@ def volume(checkpoint, model: Entries) -> Imported:
     return finished(checkpoint, model, shape, box, grid.shape[:3], values)
 
 
-def network(checkpoint, model: Entries) -> Imported:
+def network(checkpoint, model: Entries, limits: tuple[float, float]) -> Imported:
     """NeRF's network, in front of the trunk."""
     layers, trunk = model.layers("nerf_mlp."), model.layers("sigma_net.")
     frequencies = frequencies_of(layers[0][0].shape[1])
     # its last layer has no activation, and goes with the trunk's first
     layers = [*layers[:-1], joined(layers[-1], trunk[0]), *trunk[1:]]
     sigma, sections = skipping(layers, frequencies, hidden_first=False)
-    sigma |= {"activation": "exp", "limits": list(LIMITS)}
+    sigma |= {"activation": "exp", "limits": list(limits)}
     rgb, colours = harmonic_network(model, sigma["outputs"])
     encoding = {"part": "frequencies", "count": frequencies, "frame": True}
     shape = PartsShape(encoding, {"part": "trunk_features"}, sigma, rgb)

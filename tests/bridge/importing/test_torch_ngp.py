@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from formats.errors import FormatError
 from formats.foreign.systems import open_checkpoint
 from fusedrf_cli import verbs
 from fusedrf_cli.bridge.importing import torch_ngp
@@ -35,6 +36,9 @@ class Model:
     cells: bool = True
     frequencies: int = 3
     degree: int = 3
+    clip: tuple[float, float] = (-2, 7)
+    args: dict = field(default_factory=dict)
+    """Of PVD's args.txt; none where that is not there."""
     more: tuple[str, ...] = field(default=())
 
 
@@ -59,6 +63,15 @@ PVD = {
     "vm": Model("vm", trained=(-0.75, -1.0, -0.5, 1.0, 0.75, 1.0)),
     "tensors": Model("tensors"),
     "tensors of degree 2": Model("tensors", degree=2, bound=2),
+    "hash, clipped": Model(levels=14, clip=(-1.5, 1), args={"sigma_clip_min": -1.5, "sigma_clip_max": 1}),
+    "mlp, clipped": Model("mlp", clip=(-0.5, 0.5), args={"sigma_clip_min": -0.5, "sigma_clip_max": 0.5}),
+    "vm, clipped": Model("vm", clip=(-0.5, 0.5), args={"sigma_clip_min": -0.5, "sigma_clip_max": 0.5}),
+    "vm of photos": Model(
+        "vm", clip=(-1, 1), args={"sigma_clip_min": -1.0, "sigma_clip_max": 1.0, "just_train_a_model": True}
+    ),
+    "vm, edited": Model("vm", args={"enable_edit_plenoxel": True}),
+    "tensors, edited": Model("tensors", args={"enable_edit_plenoxel": True}),
+    "tensors, clipped": Model("tensors", clip=(-1, 1e3), args={"sigma_clip_min": -1, "sigma_clip_max": 1e3}),
 }
 
 
@@ -150,6 +163,11 @@ def written(model: Model, folder, pvd: bool = False, **changed):
     """A checkpoint, opened."""
     state = state_of(model, pvd) | changed
     state = {name: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for name, v in state.items()}
+    if model.args:
+        given = sorted(({"PE": 10, "stage_iters": {"stage1": 2000}, "ckpt": "a=b"} | model.args).items())
+        (folder / "args.txt").write_text("".join(f"{pair}\n" for pair in given) + "\npsnr: 31.20 \nssim: 0.9")
+        folder = folder / "checkpoints"
+        folder.mkdir()
     file = {"epoch": 3, "global_step": 1000, "stats": {"loss": [0.1], "checkpoints": []}, "model": state}
     if model.cells:
         file |= {"mean_count": 2345, "mean_density": 5.4}
@@ -198,7 +216,7 @@ def waves(x: np.ndarray, count: int) -> np.ndarray:
 
 def expected(model: Model, state: dict, points: np.ndarray, d: np.ndarray, pvd: bool):
     """σ and rgb by the system's own formulas, in the cells that it samples."""
-    low, high = (-2, 7) if pvd else (-np.inf, np.inf)
+    low, high = model.clip if pvd else (-np.inf, np.inf)
     box = state["aabb_train"].astype(np.float64)
     x, read = 2 * (points - box[:3]) / (box[3:] - box[:3]) - 1, oracle.harmonics(d)
     if model.kind == "tensors":
@@ -209,7 +227,8 @@ def expected(model: Model, state: dict, points: np.ndarray, d: np.ndarray, pvd: 
         raw = multiplied(state, "sigma", x, model.kind).sum(1)
         features = multiplied(state, "color", x, model.kind) @ state["basis_mat.weight"].T
         if pvd:
-            read = np.concatenate([read, features.clip(low, high)], 1)
+            features = features if model.args.get("just_train_a_model") else features.clip(low, high)
+            read = np.concatenate([read, features], 1)
         else:
             read = np.concatenate([waves(features, model.frequencies), waves(d, model.frequencies)], 1)
         rgb = oracle.network(read, *layers_in(state, "color_net", []))
@@ -235,6 +254,7 @@ def expected(model: Model, state: dict, points: np.ndarray, d: np.ndarray, pvd: 
         filler = np.ones((len(h), 1)) if model.networks == "tcnn" else np.zeros((len(h), 1))
         read = np.concatenate([read, h[:, 1:], *([filler] if model.networks != "torch" else [])], 1)
         rgb = oracle.network(read, *layers_in(state, "color_net", [32, 64, 64, 16]))[:, :3]
+    low = -100 if model.args.get("enable_edit_plenoxel") else low
     sigma = np.exp(raw.clip(low, high))
     inside = (np.abs(points) <= model.bound).all(1)
     inside &= ((points >= state["aabb_infer"][:3]) & (points < state["aabb_infer"][3:])).all(1)
@@ -273,7 +293,13 @@ def test_pvd(name, tmp_path):
     imported = torch_ngp.read_pvd(checkpoint)
     found = oracle.answers(imported, points, d)
     oracle.assert_alike(found, expected(model, state_of(model, True), points, d, True))
-    assert any("between -2 and 7" in note for note in imported.notes)
+    assert any("between -2 and 7" in note for note in imported.notes) == (not model.args)
+
+
+def test_limits_of_pvd_that_are_none_are_named(tmp_path):
+    checkpoint = written(Model("tensors", args={"sigma_clip_min": 7}), tmp_path, True)
+    with pytest.raises(FormatError, match="'sigma_clip_min' should be below 'sigma_clip_max'"):
+        torch_ngp.read_pvd(checkpoint)
 
 
 def test_the_command_writes_what_it_shows(tmp_path):
