@@ -94,21 +94,22 @@ def of_planes(settings: dict | None, limits: tuple[float, float]) -> tuple[float
 
 def hashed(checkpoint, model: Entries, limits: tuple[float, float]) -> Imported:
     """A hash grid, a trunk and a colour network."""
-    bound = bound_of(model)
+    bound, said = bound_of(model), []
     if "encoder.params" in model.values:
         growth = 2 ** (np.log2(FINEST * bound / BASE) / (LEVELS - 1))
         levels = tcnn.levels_of(LEVELS, LOG2_ROWS, BASE, tcnn.single(np.log2, np.float32(growth)))
         rows = tcnn.rows_of(halves(model, "encoder.params"), levels, FEATURES)
     else:
         rows, offsets = model.array("encoder.embeddings", None, None), model.array("encoder.offsets", None)
-        levels = levels_of(offsets.astype(np.int64), len(rows), bound)
+        levels, said = levels_of(offsets.astype(np.int64), len(rows), bound)
     encoding = {"part": "hash_grid", "features": rows.shape[1], "levels": levels}
     count = len(levels) * rows.shape[1]
     sigma, sections = trunk_layers(layers_of(model, "sigma_net", count, OUTPUTS), eight(count), limits=limits)
     rgb, colours = harmonic_network(model, sigma["outputs"])
     shape = PartsShape(encoding, {"part": "trunk_features"}, sigma, rgb)
     values = {"density_rows": rows} | sections | colours
-    return finished(checkpoint, model, shape, cube_of(bound), None, values)
+    made = finished(checkpoint, model, shape, cube_of(bound), None, values)
+    return replace(made, notes=[*made.notes, *said])
 
 
 def layers_of(model: Entries, name: str, inputs: int, outputs: int) -> list[Layer]:
@@ -270,19 +271,40 @@ def box_of(model: Entries, name: str) -> np.ndarray:
     return box
 
 
-def levels_of(offsets: np.ndarray, rows: int, bound: float) -> list[dict]:
-    """The levels of torch-ngp's grid: rows of one vertex more than tiny-cuda-nn's. Scales are computed in
-    float32, as there: the finest is a whole number but for rounding."""
-    count = len(offsets) - 1
-    if count < 1 or offsets[0] != 0 or offsets[-1] != rows or (np.diff(offsets) <= 0).any():
+def levels_of(offsets: np.ndarray, rows: int, bound: float) -> tuple[list[dict], list[str]]:
+    """The levels of torch-ngp's grid, and what is to be said: how many rows levels have tells how fast they
+    grow. Its own networks' finest level has 2048 vertices for each unit of the bound, others' differ."""
+    if not 2 <= len(offsets) <= 33 or offsets[0] != 0 or offsets[-1] != rows or (np.diff(offsets) <= 0).any():
         raise FormatError(f"'encoder.offsets' should count up to {rows} rows, found {offsets.tolist()[:40]}")
-    growth = np.float32(np.log2(2 ** (np.log2(FINEST * bound / BASE) / max(count - 1, 1))))
-    levels = []
-    for level, held in enumerate(np.diff(offsets)):
+    held = np.diff(offsets).tolist()
+    if levels := grown_to(FINEST * bound, held):
+        return levels, []
+    others = {n * by for n in (FINEST // 4, FINEST // 2, FINEST, 2 * FINEST, 4 * FINEST) for by in (1, bound)}
+    others |= {BASE * 2 ** (len(held) - 1)}  # twice at each level, as before that was an option
+    fitting = {finest: levels for finest in sorted(others) if (levels := grown_to(finest, held))}
+    if len(fitting) != 1:
+        raise FormatError(
+            f"'encoder.offsets' should count the rows of a grid of {BASE} to {FINEST * bound:g} vertices "
+            f"along an axis, found another's: {offsets.tolist()[:40]}"
+        )
+    ((finest, levels),) = fitting.items()
+    return levels, [f"its grid's finest level is taken to have {finest:g} vertices, as rows of others tell"]
+
+
+def grown_to(finest: float, held: Sequence[int]) -> list[dict]:
+    """Levels with one vertex more along an axis than tiny-cuda-nn's, up to a finest one, of which each holds
+    so many rows: of all its vertices, perhaps up to a run of eight, or as many as the largest; none where
+    that is not so. Scales are computed in float32, as there: the finest is whole but for rounding."""
+    power = 2 ** (np.log2(finest / BASE) / max(len(held) - 1, 1))
+    growth, levels = np.float32(np.log2(power)), []
+    for level, rows in enumerate(held):
         scale = tcnn.single(np.exp2, np.float32(level) * growth) * np.float32(BASE) - np.float32(1)
-        side, held = int(np.ceil(scale)) + 2, int(held)
-        found = tcnn.hashes(side, held)
-        levels.append({"scale": float(scale), "side": side, "rows": held, "hashed": found, "offset": 0.5})
+        side = int(np.ceil(scale)) + 2
+        sizes = [n**3 for n in (side, int(np.ceil(BASE * power**level)) + 1)]
+        if rows not in (*sizes, *map(eight, sizes)) and not (rows == max(held) and rows < min(sizes)):
+            return []
+        found = tcnn.hashes(side, rows)
+        levels.append({"scale": float(scale), "side": side, "rows": rows, "hashed": found, "offset": 0.5})
     return levels
 
 

@@ -28,6 +28,8 @@ class Model:
     features: int = 2
     rounded: bool = True
     """Whether rows of a level are a multiple of eight, as newer versions have them."""
+    finest: float = 2048
+    """desired_resolution for each unit of the bound."""
     networks: str = "torch"
     layers: tuple[int, int] = (2, 3)
     shown: tuple[float, ...] = ()
@@ -48,6 +50,9 @@ MODELS = {
     "bound 16, 3 levels": Model(bound=16, levels=3, features=1),
     "bound 4, without cells": Model(bound=4, cells=False, more=("ema",)),
     "rows as there are vertices": Model(log2_rows=14, rounded=False),
+    "a coarser grid": Model(finest=512, levels=16, log2_rows=15),
+    "a grid whatever the bound": Model(bound=4, finest=512, levels=16, log2_rows=15, more=("ema",)),
+    "twice at each level": Model(bound=2, finest=16 * 2**6 / 2, levels=7, log2_rows=19, rounded=False),
     "deeper": Model(layers=(4, 2), more=("bg_net.0.weight",)),
     "cut": Model(bound=2, shown=(-1.0, -0.5, -2.0, 1.5, 2.0, 0.25)),
     "cut to a smaller cube": Model(bound=2, shown=(-1.0,) * 3 + (1.0,) * 3),
@@ -87,7 +92,7 @@ def matrices(rng, inputs: int, outputs: int, layers: int, wide: int = 16) -> lis
 
 def scales_of(model: Model, extra: int) -> tuple[list[float], list[int]]:
     """Scales and vertices along an axis of the levels; extra: beyond one more than its scale rounded up."""
-    growth = 2 ** (np.log2(2048 * model.bound / 16) / (model.levels - 1))
+    growth = 2 ** (np.log2(model.finest * model.bound / 16) / (model.levels - 1))
     growth = np.float32(np.log2(float(np.float32(growth)) if model.networks == "tcnn" else growth))
     scales = [float(np.float32(2.0 ** float(np.float32(n) * growth) * 16) - 1) for n in range(model.levels)]
     return scales, [int(np.ceil(scale)) + 1 + extra for scale in scales]
@@ -281,6 +286,7 @@ def test_torch_ngp(name, tmp_path):
     oracle.assert_alike(oracle.answers(imported, points, d), expected(model, state, points, d, False))
     said = " ".join(imported.notes)
     assert ("moving averages" in said) == ("ema" in model.more)
+    assert ("finest level is taken to have" in said) == (model.finest != 2048)
     assert ("behind the scene" in said) == ("bg_net.0.weight" in model.more)
     assert ("is cut to" in said) == bool(model.shown)
 
@@ -318,6 +324,7 @@ def test_the_command_writes_what_it_shows(tmp_path):
     [
         ({"color_net.0.weight": None}, "'color_net.0.weight'"),
         ({"encoder.embeddings": np.zeros((9, 2), np.float32)}, "'encoder.offsets' should count up to 9 rows"),
+        ({"encoder.offsets": np.array([0, 32, 96, 192, 256], np.int32)}, "rows of a grid of 16 to 2048 ver"),
         ({"sigma_net.0.weight": np.zeros((16, 9), np.float32)}, "a network should read at most 8 features"),
         ({"sigma_net.1.weight": np.full((16, 16), np.nan, np.float32)}, "holds NaN or infinity"),
         ({"aabb_infer": np.zeros(6, np.float32)}, "three minima below three maxima"),
