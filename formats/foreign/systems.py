@@ -249,7 +249,8 @@ SYSTEMS = {  # the first whose rule fits counts
         "!model/deform_net.* !model/basis_net.* !model/ambient_net.*"
         "| model/encoder.embeddings:* model/sigma_net.weights:* model/color_net.weights:*"
         "| model/encoder.params:* model/sigma_net.params:* model/color_net.params:*"
-        "| model/sigma_vec.0:* model/color_vec.0:* model/basis_mat.weight:* model/color_net.0.weight:*",
+        "| model/sigma_vec.0:* model/color_vec.0:* model/basis_mat.weight:* model/color_net.0.weight:*"
+        "| model/U_vec_density.0:* model/S_vec_density.0:* model/U_vec.0:* model/S_vec.0:*",
     ),
     "nerfacto": System(
         "nerfstudio's nerfacto",

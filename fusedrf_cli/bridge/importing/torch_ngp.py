@@ -1,6 +1,6 @@
-"""Checkpoints of torch-ngp (github.com/ashawkey/torch-ngp), and of PVD (Fang et al., AAAI 2023), which is
-built on it: hash grids, planes and lines, networks, volumes. Its networks may be torch's, or those of its own
-fused kernels or of tiny-cuda-nn, which are one array each."""
+"""Checkpoints of torch-ngp (github.com/ashawkey/torch-ngp) with CCNeRF, and of PVD (Fang et al., AAAI 2023),
+which is built on it: hash grids, planes and lines, networks, volumes. Its networks may be torch's, or those
+of its own fused kernels or of tiny-cuda-nn, which are one array each."""
 
 import itertools
 import operator
@@ -25,6 +25,7 @@ from fusedrf_cli.bridge.importing.parts import (
     ranks_filled,
     trunk_layers,
 )
+from fusedrf_cli.engine.fields.box import MAX_TEXELS
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsShape
 
@@ -54,6 +55,8 @@ def read(checkpoint) -> Imported:
     model = Entries(checkpoint.entries).inside("model")
     if "basis_mat.weight" in model.values:
         return planes(checkpoint, model, "waves", EXPONENTS, None)
+    if "U_vec_density.0" in model.values:
+        return products(checkpoint, model)
     return hashed(checkpoint, model, EXPONENTS)
 
 
@@ -175,6 +178,74 @@ def planes(
     rgb |= {} if of_colours is None else {"limits": list(of_colours)}
     shape = PartsShape(*encodings, sigma, rgb)
     return finished(checkpoint, model, shape, box, resolution, values)
+
+
+def products(checkpoint, model: Entries) -> Imported:
+    """Weighted sums of products of three lines and of three planes (CCNeRF, Tang et al., NeurIPS 2022), for
+    the density and for the colours' harmonics. Beside the last texels they fall to 0."""
+    if "T_1" in model.values:
+        raise FormatError("a scene composed of several objects is not read; import each, and compose them")
+    texels = [model.array(f"U_vec_density.{2 - axis}", 1, None, None, 1).shape[2] for axis in range(3)]
+    density, weights = factors_of(model, "_density", texels)
+    colour, basis = factors_of(model, "", texels)
+    coefficients, rest = divmod(len(basis), 3)
+    if len(weights) != 1 or rest or coefficients not in (1, 4, 9, 16):
+        raise FormatError(
+            f"'S_vec_density.0' and 'S_vec.0' should have 1 and 3 times 1, 4, 9 or 16 rows, found "
+            f"{len(weights)} and {len(basis)}"
+        )
+    counts = np.array(texels) + 2
+    box, margin = around_cube(box_of(model, "aabb_train"), texels, cube_of(bound_of(model)))
+    encodings = [
+        {"part": "planes", "features": eight(made["line_0_0"].shape[-1]), "scales": [counts.tolist()],
+         "lines": True, "margin": margin}
+        for made in (density, colour)
+    ]  # fmt: skip
+    resolution = np.ceil(counts / (1 - 2 * margin)).clip(2, MAX_TEXELS).astype(int).tolist()
+    sigma = {"part": "density_linear", "activation": "exp", "limits": list(EXPONENTS)}
+    shape = PartsShape(*encodings, sigma, {"part": "sh_basis", "coefficients": coefficients})
+    values = {f"density_{name}": value for name, value in density.items()}
+    values |= {f"colour_{name}": value for name, value in colour.items()}
+    values |= {"sigma_weights": weights[0], "rgb_basis": basis.reshape(3, coefficients, -1)}
+    return finished(checkpoint, model, shape, box, resolution, values)
+
+
+def around_cube(box: np.ndarray, texels: Sequence[int], cube: np.ndarray) -> tuple[np.ndarray, float]:
+    """A box (6,) that a cube (6,) lies in, and the share of its sides that lies outside of texels over
+    another box, whose faces are faces of texels, and one more on each side."""
+    middle, half = (box[:3] + box[3:]) / 2, (box[3:] - box[:3]) / 2
+    half = half * (np.array(texels) + 1) / texels
+    wider = max(1.0, float((np.maximum(cube[3:] - middle, middle - cube[:3]) / half).max()))
+    margin = min((1 - 1 / wider) / 2, 0.49)
+    half = half / (1 - 2 * margin)
+    return np.concatenate([middle - half, middle + half]), margin
+
+
+def factors_of(model: Entries, which: str, texels: Sequence[int]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Planes and lines by the names of our sections, with a texel of 0 around, and the weights (outputs,
+    ranks) of their products: of lines first, whose planes are 1, and then of planes, whose lines are 1."""
+    weights, found = {}, {}
+    for part in ("vec", "mat"):
+        groups = range(sum(str(name).startswith(f"S_{part}{which}.") for name in model.values))
+        weights[part] = [model.array(f"S_{part}{which}.{k}", None, None) for k in groups]
+        for i, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
+            shape = (texels[2 - i], 1) if part == "vec" else (texels[b], texels[a])
+            names = [f"U_{part}{which}.{3 * k + i}" for k in groups]
+            sizes = [weight.shape[1] for weight in weights[part]]
+            held = [model.array(name, 1, n, *shape)[0] for name, n in zip(names, sizes, strict=True)]
+            found[part, i] = np.concatenate([np.zeros((0, *shape), np.float32), *held])
+    every = [*weights["vec"], *weights["mat"]]
+    if len({len(weight) for weight in every}) != 1:
+        raise FormatError(f"'S_vec{which}.*' and 'S_mat{which}.*' should have as many rows")
+    made = {}
+    for i in range(3):
+        line = np.pad(found["vec", i][..., 0].T, [(1, 1), (0, 0)])
+        plane = np.pad(found["mat", i].transpose(2, 1, 0), [(1, 1), (1, 1), (0, 0)])
+        ones = [np.ones((*at.shape[:-1], n), np.float32)
+                for at, n in ((line, plane.shape[-1]), (plane, line.shape[-1]))]  # fmt: skip
+        made[f"line_0_{2 - i}"] = np.concatenate([line, ones[0]], -1)
+        made[f"plane_0_{i}"] = np.concatenate([ones[1], plane], -1)
+    return made, np.concatenate(every, 1)
 
 
 def volume(checkpoint, model: Entries, limits: tuple[float, float]) -> Imported:
