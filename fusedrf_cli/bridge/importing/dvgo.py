@@ -4,6 +4,7 @@ DirectVoxGO and DirectContractedVoxGO, on dense or TensoRF grids, and those of e
 import numpy as np
 
 from formats.errors import FormatError
+from fusedrf_cli.bridge.importing.cells import MOST_CELLS
 from fusedrf_cli.bridge.importing.parts import (
     Y0,
     ColourInput,
@@ -24,6 +25,9 @@ from fusedrf_cli.engine.spaces import bounded, contracted_l2, contracted_linf, s
 
 NORM = "it does not say by which norm it is contracted, so 'inf' is taken; earlier versions had 'l2'"
 MASK = "the coarse densities that mask it are asked at its vertices, and not between them"
+CELLS = "the coarse densities that mask it are asked in the middle of cells"
+BEGUN = float(np.log(1 / (1 - 1e-6) - 1))
+"""What the recipe adds to coarse densities: as opaque as 1e-6."""
 MODES = (("xy", "z", 0, 1, 2), ("xz", "y", 0, 2, 1), ("yz", "x", 1, 2, 0))
 
 
@@ -57,7 +61,7 @@ def read(checkpoint) -> Imported:
     if not (voxels := kwargs.number("num_voxels_base")) > 0:
         raise FormatError(f"model_kwargs: 'num_voxels_base' should be above 0, found {voxels:g}")
     base = (np.prod(box[3:] - box[:3]) / voxels) ** (1 / 3)
-    cells, more_notes = cells_of(state, box, space)
+    cells, more_notes = cells_of(kwargs, state, box, space)
     field = parts_field(shape, box, resolution, values | shading, 1 / base, shift_of(kwargs, state), cells)
     return Imported([ImportedNode(field, placement)], notes + more_notes)
 
@@ -194,10 +198,12 @@ def space_and_placement(kwargs: Entries, state: Entries, box: np.ndarray):
     return space_of(spaces[norm], shell=float(shell), contracted_density=1.0), placement, notes
 
 
-def cells_of(state: Entries, box: np.ndarray, space) -> tuple[OccupancyGrid, list[str]]:
+def cells_of(kwargs: Entries, state: Entries, box: np.ndarray, space) -> tuple[OccupancyGrid, list[str]]:
     """The mask cache, whose samples each stand for a cell around them, and what is to be said of it."""
     if "nonempty_mask" in state.values:
         held = state.array("nonempty_mask", 1, 1, None, None, None)[0, 0] > 0
+        if (cells := coarse_cells(kwargs, state, box, held)) is not None:
+            return OccupancyGrid(box, cells), [CELLS]
         return OccupancyGrid(box, between(held)), [MASK]
     if {"mask_cache.mask", "mask_cache.xyz2ijk_scale"}.isdisjoint(state.values):
         return OccupancyGrid.full(box, space=space), []
@@ -207,3 +213,35 @@ def cells_of(state: Entries, box: np.ndarray, space) -> tuple[OccupancyGrid, lis
         raise FormatError("'mask_cache.xyz2ijk_scale' should be above 0")
     faces = [(-0.5 - shift) / scale, (np.array(mask.shape) - 0.5 - shift) / scale]
     return OccupancyGrid(np.concatenate(faces), mask, space), []
+
+
+def coarse_cells(kwargs: Entries, state: Entries, box: np.ndarray, held: np.ndarray) -> np.ndarray | None:
+    """Cells of the box (6,) by the coarse densities of the first version, as fine as MOST_CELLS allows: those
+    in whose middle they are above a threshold. What they are at vertices that are `held` (X, Y, Z), and at
+    others, tells it, and whether it is the recipe's. None where it does not."""
+    if "mask_cache.density" not in state.values or held.all() or not held.any() or min(held.shape) < 2:
+        return None
+    density = state.array("mask_cache.density", 1, 1, None, None, None)[0, 0].astype(np.float64)
+    low, high = (state.array(f"mask_cache.xyz_{end}", 3).astype(np.float64) for end in ("min", "max"))
+    parts = max(1, int((MOST_CELLS / np.prod(np.array(held.shape) - 1)) ** (1 / 3) + 1e-9))
+
+    def asked(shares: list[np.ndarray]) -> np.ndarray:
+        """The densities where the box is divided by these on each axis, 0 beyond their own."""
+        values = density
+        for axis, share in enumerate(shares):
+            count = density.shape[axis]
+            at = box[axis] + share * (box[3 + axis] - box[axis])
+            at = (at - low[axis]) / (high[axis] - low[axis]) * (count - 1)
+            weights = np.maximum(0, 1 - np.abs(at[:, None] - np.arange(count)))
+            values = np.moveaxis(np.tensordot(weights, values, (1, axis)), 0, axis)
+        return values
+
+    at_vertices = asked([np.linspace(0, 1, n) for n in held.shape])
+    least, most = at_vertices[held].min(), at_vertices[~held].max()
+    if not (low < high).all() or most > least + 1e-4 * np.abs(density).max():
+        return None
+    opacity = kwargs.number("mask_cache_thres", 1e-3)
+    usual = np.log(np.expm1(-np.log1p(-opacity))) - BEGUN if 0 < opacity < 1 else least
+    threshold = usual if most < usual <= least else (least + most) / 2
+    counts = (np.array(held.shape) - 1) * parts
+    return asked([(np.arange(n) + 0.5) / n for n in counts]) >= threshold

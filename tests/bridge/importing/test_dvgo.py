@@ -2,7 +2,7 @@
 
 import re
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -285,6 +285,49 @@ def test_vertices_that_the_first_version_masks_are_taken_as_they_are(tmp_path):
     kept = mask[tuple(np.moveaxis(np.clip(corners, 0, np.array(model.size) - 1), 2, 0))].any(1)
     assert_equal(answers(imported.nodes[0], points, dirs), (np.where(inside & kept, sigma, 0), rgb))
     assert imported.notes == [dvgo.MASK]
+
+
+def coarse_mask(shape: tuple[int, int, int], low: np.ndarray, high: np.ndarray):
+    """Densities of a first version's coarse stage, as MaskCache has them, and which points its forward keeps:
+    a ball."""
+    at = np.stack(
+        np.meshgrid(*(np.linspace(a, b, n) for a, b, n in zip(low, high, shape, strict=True)), indexing="ij"),
+        -1,
+    )
+    density = np.float32(12 - 10 * np.linalg.norm(at - BOX.mean(0), axis=-1))
+    density = torch.nn.functional.max_pool3d(torch.from_numpy(density)[None, None], 3, 1, 1)
+    shift = np.log(1 / (1 - 1e-6) - 1)
+
+    def keeps(points: np.ndarray) -> np.ndarray:
+        at = torch.from_numpy((points.astype(np.float64) - low) / (high - low) * 2 - 1)
+        grid = at[None, None, None].flip(-1)
+        raw = torch.nn.functional.grid_sample(density.double(), grid, align_corners=True)[0, 0, 0, 0]
+        return 1 - np.exp(-softplus(raw.numpy() + shift)) >= 1e-3
+
+    return density, keeps
+
+
+@pytest.mark.parametrize("size", [(7, 5, 9), (41, 47, 44)])
+def test_a_mask_of_coarse_densities_is_taken_in_fine_cells(size, tmp_path):
+    """As well as cells are fine; that it is so is said."""
+    model = replace(MODELS["first version"], size=size)
+    low, high = BOX[0] - np.float32(0.1), BOX[1] + np.float32([0.1, 0.2, -0.3])
+    density, keeps = coarse_mask((11, 13, 12), low, high)
+    vertices = np.meshgrid(*(np.linspace(a, b, n) for a, b, n in zip(*BOX, size, strict=True)), indexing="ij")
+    held = keeps(np.stack(vertices, -1).reshape(-1, 3)).reshape(size)
+
+    def masked(held_file: dict) -> None:
+        state = held_file["model_state_dict"]
+        state |= {"mask_cache.density": density, "nonempty_mask": torch.from_numpy(held[None, None])}
+        state |= {f"mask_cache.xyz_{n}": torch.from_numpy(at) for n, at in (("min", low), ("max", high))}
+
+    imported = dvgo.read(open_checkpoint(saved(model, tmp_path, masked)))
+    points, dirs = BOX[0] + (BOX[1] - BOX[0]) * np.random.default_rng(3).random((4000, 3)), directions(4000)
+    found, (sigma, _) = answers(imported.nodes[0], points, dirs)[0], expected(model, points, dirs)
+    wanted = np.where(keeps(points), sigma, 0)
+    assert (wanted > 0).mean() > 0.03 and (wanted == 0).mean() > 0.3
+    assert np.isclose(found, wanted, rtol=1e-4).mean() > 0.99
+    assert imported.notes == [dvgo.CELLS]
 
 
 def test_a_tensorf_grid_whose_colours_read_the_point_is_none(tmp_path):
