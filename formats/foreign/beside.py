@@ -1,4 +1,5 @@
-"""Settings that a run leaves beside its checkpoint: YAML, JSON, "key = value" lines and Python literals.
+"""Settings that a run leaves beside its checkpoint: YAML, JSON, lines "key = value" or "('key', value)", and
+Python literals.
 
 None of them runs anything: YAML's Python tags are ignored, Python is parsed and only literals are taken.
 """
@@ -92,9 +93,14 @@ def _yaml(text: str) -> object:
 
 
 def _lines(text: str) -> dict[str, object]:
-    """Lines "key = value", as argparse and gin settings are written; a value that is no literal is text."""
+    """Lines "key = value", as argparse and gin settings are written; a value that is no literal is text. Or
+    lines "('key', value)" of literals, as PVD's are."""
     settings = {}
     for line in text.splitlines():
+        if line.startswith("(") and isinstance(pair := _value(line), list):
+            if len(pair) == 2 and isinstance(pair[0], str):
+                settings[pair[0]] = pair[1]
+            continue
         key, equals, value = line.partition("=")
         if equals and not line.startswith(("#", " ")):
             settings[key.strip()] = _value(value.strip())

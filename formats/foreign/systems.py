@@ -251,6 +251,7 @@ SYSTEMS = {  # the first whose rule fits counts
         "model/encoder.embeddings:* model/encoder.offsets:15 model/sigma_net.0.weight:* !model/deform_net.*"
         "| model/nerf_mlp.0.weight:* model/sigma_net.0.weight:* | model/tensor_volume.0:*"
         "| model/sigma_mat.0:* model/color_mat.0:* model/basis_mat.weight:15x*",
+        ("args.txt",),
     ),
     "torch-ngp": System(  # but for its networks of moving scenes
         "torch-ngp",
@@ -258,7 +259,8 @@ SYSTEMS = {  # the first whose rule fits counts
         "!model/deform_net.* !model/basis_net.* !model/ambient_net.*"
         "| model/encoder.embeddings:* model/sigma_net.weights:* model/color_net.weights:*"
         "| model/encoder.params:* model/sigma_net.params:* model/color_net.params:*"
-        "| model/sigma_vec.0:* model/color_vec.0:* model/basis_mat.weight:* model/color_net.0.weight:*",
+        "| model/sigma_vec.0:* model/color_vec.0:* model/basis_mat.weight:* model/color_net.0.weight:*"
+        "| model/U_vec_density.0:* model/S_vec_density.0:* model/U_vec.0:* model/S_vec.0:*",
     ),
     "nerfacto": System(
         "nerfstudio's nerfacto",

@@ -20,7 +20,7 @@ from formats.splats.reading import is_splats, newest_point_cloud
 from formats.splats.splats import UP_Z
 from formats.views import Capture
 from fusedrf_cli import __version__
-from fusedrf_cli.bridge.importing import nerf, splats
+from fusedrf_cli.bridge.importing import dvgo, nerf, splats
 from fusedrf_cli.bridge.importing.parts import Imported
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.views import unit_vector
@@ -54,10 +54,7 @@ MOVING = "k-planes", "d2nerf"
 """Systems whose scenes may move."""
 SPLATS = "splatfacto", "gsplat", "3dgs"
 """Systems whose scenes are Gaussian splats."""
-UNREAD = {
-    "dmpigo": "its density is counted along the axis of a camera, and its colours depend on directions "
-    "outside its space, which the file does not tell; train it with DVGO's bounded or unbounded model"
-}
+UNREAD = {"dmpigo": dvgo.FORWARD}
 """Why checkpoints of a system are not read, where that is known."""
 COPIES = 5.5
 """Of an array, of what its field takes: read, rearranged, as numbers and as they are written."""

@@ -28,6 +28,12 @@ from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsField, PartsShape
 
 TWIST = 6  # numbers that move a point
+READ = {
+    "norm_type": "none", "activation": "relu", "sigma_activation": "softplus", "blend_mode": "add",
+    "use_pivot": "False", "use_translation": "False", "spatial_point_min_deg": "0",
+    "hyper_point_min_deg": "0", "viewdir_min_deg": "0", "min_deg": "0",
+}  # fmt: skip
+"""Of settings that are not in the file, the only value that is read."""
 NONE = {"count": 0, "hidden": 8, "layers": 1, "skip": 0}
 """A network that does nothing."""
 
@@ -95,10 +101,25 @@ class Model:
         return codes[i] + (time - i) * (codes[min(i + 1, len(codes) - 1)] - codes[i])
 
 
+def check_settings(beside: Mapping[str, Any]) -> None:
+    """Raise FormatError where a run's settings say that its networks compute something else; those of the
+    model that it extends do not count."""
+    for name, settings in beside.items():
+        for key, value in settings.items() if isinstance(settings, Mapping) else ():
+            owner, _, last = str(key).rpartition(".")
+            if owner == "NerfModel" or last not in READ or value is None:
+                continue
+            value = settings.get(str(value)[1:], value) if str(value).startswith("%") else value
+            plain = str(value).rpartition(".")[2]  # of @jax.nn.relu
+            if plain != READ[last] and plain[:1] not in ("%", "\\"):
+                raise FormatError(f"{name}: '{key}' should be {READ[last]}, found {str(value)[:40]}")
+
+
 def read(checkpoint, box: np.ndarray, time: float | None = None) -> Imported:
     """What stands still, and what moves as it is at a `time`, in a box (6,): fields whose densities add up.
     Times are counted from 0; between two the codes of both are mixed. Without a time what stands still, in
     no shadow. Raises FormatError."""
+    check_settings(checkpoint.beside)
     model = Model(checkpoint)
     notes = ["of its coarse and fine networks the fine ones are taken"] * model.level.endswith("fine")
     if time is None:
@@ -199,12 +220,8 @@ def side_by_side(first: Trunk, second: Trunk) -> Trunk:
         layers.append((diagonal(*blocks), np.concatenate([bias for _, bias in pair])))
         if i in first.again or i in second.again:
             width = layers[0][0].shape[1]
-            again[i] = np.concatenate(
-                [
-                    t.again.get(i, np.zeros((len(w), width)))
-                    for t, (w, _) in zip((first, second), pair, strict=True)
-                ]
-            )
+            both = zip((first, second), pair, strict=True)
+            again[i] = np.concatenate([t.again.get(i, np.zeros((len(w), width))) for t, (w, _) in both])
     return Trunk(layers, again)
 
 

@@ -100,14 +100,15 @@ def levels_of(encoding: Entries, scale: int) -> tuple[list[dict], int]:
     """The levels of the grid, and numbers of a row."""
     kind = str(encoding.values.get("otype", "HashGrid")).lower()
     rows = str(encoding.values.get("type", "hash" if kind == "grid" else kind.removesuffix("grid"))).lower()
-    between = str(encoding.values.get("interpolation", "Linear"))
-    if kind not in ("hashgrid", "densegrid", "grid") or rows not in ("hash", "dense"):
+    if kind not in ("hashgrid", "densegrid", "tiledgrid", "grid") or rows not in ("hash", "dense", "tiled"):
         raise FormatError(
-            f"encoding: 'otype' should be HashGrid or DenseGrid, found {kind[:40]!r} of {rows[:40]!r}; "
-            "other encodings are not read"
+            "encoding: 'otype' should be HashGrid, DenseGrid or TiledGrid, found "
+            f"{kind[:40]!r} of {rows[:40]!r}; other encodings are not read"
         )
-    if between.lower() != "linear":
-        raise FormatError(f"encoding: 'interpolation' should be Linear, found {between[:40]!r}")
+    for key, expected in (("interpolation", "Linear"), ("hash", "CoherentPrime")):
+        found = str(encoding.values.get(key, expected))
+        if found.lower() != expected.lower():
+            raise FormatError(f"encoding: '{key}' should be {expected}, found {found[:40]!r}")
     features = encoding.whole("n_features_per_level", 1, 8, 2)
     count = encoding.whole("n_features", 0, 256, 0) // features or encoding.whole("n_levels", 1, 32, 16)
     log2_rows = encoding.whole("log2_hashmap_size", 1, 26, 15)
@@ -117,7 +118,7 @@ def levels_of(encoding: Entries, scale: int) -> tuple[list[dict], int]:
         ratio = np.float32(FINEST) * np.float32(scale) / np.float32(base)
         growth = tcnn.single(np.exp, tcnn.single(np.log, ratio) / np.float32(max(count - 1, 1)))
     log2_growth = tcnn.single(np.log2, np.float32(growth))
-    return tcnn.levels_of(count, log2_rows, base, log2_growth, rows == "dense"), features
+    return tcnn.levels_of(count, log2_rows, base, log2_growth, rows), features
 
 
 def networks(

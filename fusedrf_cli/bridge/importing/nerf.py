@@ -32,7 +32,10 @@ SAMPLES = 256
 """Vertices along the longest side by which rays are sampled."""
 BASE, FINEST = 16, 512  # vertices of HashNeRF's coarsest grid, and of the finest where nothing is said
 FINE = "of its coarse and fine networks the fine one is taken"
-NDC = "its frame is that of the normalised device coordinates that it was trained in"
+NDC = (
+    "its frame is that of the normalised device coordinates that it was trained in; its colours read the "
+    "world's directions, and are given those of its frame"
+)
 
 
 def read(checkpoint, box: np.ndarray) -> Imported:

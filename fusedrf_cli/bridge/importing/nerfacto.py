@@ -1,5 +1,5 @@
 """nerfstudio's nerfacto (Tancik et al., SIGGRAPH 2023; github.com/nerfstudio-project/nerfstudio), computed by
-torch or by tiny-cuda-nn."""
+torch or by tiny-cuda-nn, and its instant-ngp, whose field is the same but for its space until April 2023."""
 
 from collections.abc import Mapping
 from itertools import product
@@ -25,13 +25,17 @@ from fusedrf_cli.bridge.importing.parts import (
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.reference import sh_basis
 from fusedrf_cli.engine.kinds.assembled.field import PartsShape
-from fusedrf_cli.engine.spaces import bounded, contracted_linf
+from fusedrf_cli.engine.spaces import bounded, contracted_l2, contracted_linf
 
 FIELD = "_model.field."
 HARMONICS = 16
 USUAL = {"base_res": 16, "features_per_level": 2, "hidden_dim": 64, "hidden_dim_color": 64}
 SIZES = {"max_res": 2048, "num_levels": 16, "log2_hashmap_size": 19}
 """What a model of before these were stored in the file has, unless its settings say so."""
+EARLIER = 4096, 1024
+"""What the finest level of a model of 2022 may have as well: its numbers tell."""
+BALL, BOX = 2, 0
+"""Numbers of contractions before April 2023 (ContractionType of nerfacc)."""
 DEPTHS = 1, 2, 3, 4, 5, 6, 0  # hidden layers that networks may have beside the usual
 MOST_SAMPLES = 512  # vertices along an axis by which rays are sampled
 DENSITY = 0.01  # average_init_density of the recipe
@@ -41,12 +45,59 @@ OWN_ARRAYS = "mlp_base.params", "mlp_base.model.params", "mlp_base_mlp.tcnn_enco
 
 def read(checkpoint) -> Imported:
     """The field of a checkpoint. Raises FormatError."""
-    pipeline = Entries(checkpoint.entries).inside("pipeline")
-    state, marched = (
-        state_of(pipeline, FIELD),
-        any("_model.occupancy_grid." in str(name) for name in pipeline.values),
-    )
+    pipeline = named(Entries(checkpoint.entries).inside("pipeline"))
+    state = state_of(pipeline, FIELD)
+    marched = any(name.startswith("_model.occupancy_grid.") for name in pipeline)
     settings = Entries(model_settings(checkpoint.beside.get("config.yml")), "config.yml: ")
+    finest, *sizes = sizes_of(state, settings)
+    codes = codes_of(state, settings, marched)
+    known = 0 if codes is None else len(codes)
+    if any(name in state.values for name in OWN_ARRAYS):
+        levels, rows, trunk = tcnn_base(state, settings, finest, *sizes)
+        head, outputs = tcnn_head(state, settings, len(trunk[-1][0]), known)
+        trunk[-1] = trunk[-1][0][:outputs], None if trunk[-1][1] is None else trunk[-1][1][:outputs]
+    else:
+        levels, rows, trunk = torch_base(state, finest[0], *sizes)
+        outputs, head = len(trunk[-1][0]), torch_head(state)
+    head = folded(head, codes, HARMONICS + outputs - 1)
+    sigma, sections = trunk_layers(trunk, eight(len(levels) * rows.shape[1]))
+    order = ColourInput(sigma["outputs"], sigma["outputs"], harmonics=True)
+    columns = np.concatenate([order.at("direction"), order.at("features")[1:outputs]])
+    rgb, more = colour_network(head, order, columns)
+    encoding = {"part": "hash_grid", "features": rows.shape[1], "levels": levels}
+    shape = PartsShape(encoding, {"part": "trunk_features"}, sigma, rgb)
+    cells, frame, assumed = space_of_run(pipeline, state, settings)
+    resolution = (min(*finest, MOST_SAMPLES) + 1,) * 3
+    scale, notes = density_of(state, settings, marched)
+    notes += assumed
+    if marched:  # nerfstudio's instant-ngp, whose field this is as well
+        notes.append(
+            "the grid of cells that its pictures are sampled in is left out: it is sampled everywhere"
+        )
+    numbers = {"density_rows": rows} | sections | more
+    field = parts_field(shape, cells.aabb, resolution, numbers, scale * frame[0, 0], occupancy=cells)
+    placement, said = placement_of(checkpoint.beside.get("dataparser_transforms.json"))
+    if codes is not None:
+        said.append(f"its appearance codes are fixed to {'their mean' if codes.any() else '0'}")
+    return Imported([ImportedNode(field, placement @ frame)], notes + said, up=up_of(placement))
+
+
+def named(pipeline: Entries) -> dict[str, Any]:
+    """The entries of a pipeline by their names on one GPU: runs on several have "module." in front of a name,
+    or within."""
+    plain = {str(name).removeprefix("module."): value for name, value in pipeline.values.items()}
+    return {name.replace("_model.module.", "_model.", 1): value for name, value in plain.items()}
+
+
+def state_of(pipeline: Mapping[str, Any], prefix: str) -> Entries:
+    """Those entries of a pipeline, as `named` has it, whose names begin so, by the rest of their names."""
+    found = {name.removeprefix(prefix): pipeline[name] for name in pipeline if name.startswith(prefix)}
+    return Entries(found, prefix)
+
+
+def sizes_of(state: Entries, settings: Entries) -> tuple[list[int], int, int, int]:
+    """Of the hash grid: vertices along an axis that its finest level may have, levels, the exponent of their
+    rows, and vertices of its coarsest level."""
     finest, count, log2_rows = (
         int((state if name in state.values else settings).number(name, default))
         for name, default in SIZES.items()
@@ -56,48 +107,8 @@ def read(checkpoint) -> Imported:
         raise FormatError(
             f"a grid of {count} levels of {base} to {finest} vertices and 2^{log2_rows} rows is not read"
         )
-    codes = codes_of(state, settings)
-    known = 0 if codes is None else len(codes)
-    if any(name in state.values for name in OWN_ARRAYS):
-        levels, rows, trunk = tcnn_base(state, settings, finest, count, log2_rows, base)
-        head, outputs = tcnn_head(state, settings, len(trunk[-1][0]), known)
-        trunk[-1] = trunk[-1][0][:outputs], None if trunk[-1][1] is None else trunk[-1][1][:outputs]
-    else:
-        levels, rows, trunk = torch_base(state, finest, count, log2_rows, base)
-        outputs, head = len(trunk[-1][0]), torch_head(state)
-    head = folded(head, codes, HARMONICS + outputs - 1)
-    sigma, sections = trunk_layers(trunk, eight(count * rows.shape[1]))
-    order = ColourInput(sigma["outputs"], sigma["outputs"], harmonics=True)
-    columns = np.concatenate([order.at("direction"), order.at("features")[1:outputs]])
-    rgb, more = colour_network(head, order, columns)
-    encoding = {"part": "hash_grid", "features": rows.shape[1], "levels": levels}
-    shape = PartsShape(encoding, {"part": "trunk_features"}, sigma, rgb)
-    contracted = not settings.values.get("disable_scene_contraction", False)
-    box = np.array([-2.0] * 3 + [2.0] * 3) if contracted else own_box(state)
-    cells = OccupancyGrid.full(box, space=contracted_linf if contracted else bounded)
-    resolution = (min(finest, MOST_SAMPLES) + 1,) * 3
-    scale, notes = density_of(state, settings, marched)
-    if marched:  # nerfstudio's instant-ngp, whose field this is as well
-        notes.append(
-            "the grid of cells that its pictures are sampled in is left out: it is sampled everywhere"
-        )
-    field = parts_field(
-        shape, box, resolution, {"density_rows": rows} | sections | more, scale, occupancy=cells
-    )
-    placement, said = placement_of(checkpoint.beside.get("dataparser_transforms.json"))
-    if codes is not None:
-        said.append(f"its appearance codes are fixed to {'their mean' if codes.any() else '0'}")
-    return Imported([ImportedNode(field, placement)], notes + said, up=up_of(placement))
-
-
-def state_of(pipeline: Entries, prefix: str) -> Entries:
-    """The entries whose names begin so. Runs on several GPUs have "module." in front of a name, or within."""
-    found = {}
-    for name, value in pipeline.values.items():
-        plain = str(name).removeprefix("module.").replace("_model.module.", "_model.", 1)
-        if plain.startswith(prefix):
-            found[plain.removeprefix(prefix)] = value
-    return Entries(found, prefix)
+    told = "max_res" in state.values or "max_res" in settings.values
+    return [finest] if told else [finest, *EARLIER], count, log2_rows, base
 
 
 def model_settings(config: Any) -> Mapping[str, Any]:
@@ -117,10 +128,39 @@ def density_of(state: Entries, settings: Entries, marched: bool) -> tuple[float,
         return scale, []
     before = marched or not {"mlp_base.model.params", "mlp_base.model.0.hash_table"} & set(state.values)
     scale = 1.0 if before else DENSITY
+    shown = "none" if marched else "the mean"
     return scale, [
         "no config.yml lies beside it: its recipe's settings are assumed, densities that begin at "
-        f"{scale:g}, contracted space, the mean of appearance codes"
+        f"{scale:g}, contracted space, {shown} of appearance codes"
     ]
+
+
+def space_of_run(pipeline: dict[str, Any], state: Entries, settings: Entries):
+    """A grid of all cells of the space that the field's numbers lie in, the placement (4, 4) of its frame in
+    the model's coordinates, and notes."""
+    before = "_model.occupancy_grid._binary" in pipeline and "max_res" not in state.values
+    if not before and "contraction_type" not in settings.values:
+        contracted = not settings.values.get("disable_scene_contraction", False)
+        box = np.array([-2.0] * 3 + [2.0] * 3) if contracted else own_box(state)
+        cells = OccupancyGrid.full(box, space=contracted_linf if contracted else bounded)
+        return cells, np.eye(4), []
+    said = settings.values.get("contraction_type", BALL)
+    said = said[0] if isinstance(said, list) and len(said) == 1 else said
+    box = own_box(state)
+    if said == BOX:
+        return OccupancyGrid.full(box), np.eye(4), []
+    if said != BALL:
+        raise FormatError(
+            f"config.yml: 'contraction_type' should be {BALL}, of a ball, or {BOX}, of a box, found "
+            f"{str(said)[:40]}"
+        )
+    sides = box[3:] - box[:3]
+    if not np.allclose(sides, sides[0]):
+        raise FormatError(f"the box in a contracted scene should be a cube, found {box.tolist()}")
+    frame = np.diag([*sides / 2, 1])
+    frame[:3, 3] = (box[:3] + box[3:]) / 2
+    notes = [] if settings.values else ["its space is taken as contracted around a ball, its recipe's"]
+    return OccupancyGrid.full(np.array([-2.0] * 3 + [2.0] * 3), space=contracted_l2), frame, notes
 
 
 def own_box(state: Entries) -> np.ndarray:
@@ -131,15 +171,17 @@ def own_box(state: Entries) -> np.ndarray:
     return box
 
 
-def codes_of(state: Entries, settings: Entries) -> np.ndarray | None:
-    """The code of pictures that is shown: the mean of those that were learnt, or 0."""
-    name = "embedding_appearance.embedding.weight"
-    if name not in state.values:
+def codes_of(state: Entries, settings: Entries, marched: bool) -> np.ndarray | None:
+    """The code of pictures that is shown: the mean of those that were learnt, or 0, as always before that was
+    a setting and in nerfstudio's instant-ngp."""
+    names = "embedding_appearance.embedding.weight", "appearance_embedding.embedding.weight"
+    if (name := next((name for name in names if name in state.values), None)) is None:
         return None
     codes = state.array(name, None, None).astype(np.float64)
     if not codes.size:
         return None
-    return codes.mean(0) if settings.values.get("use_average_appearance_embedding", True) else 0 * codes[0]
+    averaged = settings.values.get("use_average_appearance_embedding", not settings.values and not marched)
+    return codes.mean(0) if averaged else 0 * codes[0]
 
 
 def folded(head: list[Layer], codes: np.ndarray | None, read: int) -> list[Layer]:
@@ -203,20 +245,23 @@ def harmonics_as_there() -> np.ndarray:
 # -- computed by tiny-cuda-nn --------------------------------------------------------------------------------
 
 
-def tcnn_base(state: Entries, settings: Entries, finest: int, count: int, log2_rows: int, base: int):
+def tcnn_base(state: Entries, settings: Entries, finest: list[int], count: int, log2_rows: int, base: int):
     """See torch_base. Numbers are halves where they are computed with. The outputs are what they are filled
     up to."""
-    growth = np.exp((np.log(finest) - np.log(base)) / (count - 1)) if count > 1 else 1.0
-    levels = tcnn.levels_of(count, log2_rows, base, tcnn.single(np.log2, np.float32(growth)))
-    rows = sum(level["rows"] for level in levels)
     name = next(name for name in OWN_ARRAYS if name in state.values)
     params = halves(state, name)
     apart = name == OWN_ARRAYS[2]
     table = halves(state, "mlp_base_grid.tcnn_encoding.params") if apart else None
     found = settings.whole("features_per_level", 1, 8, USUAL["features_per_level"])
-    for features, outputs, neurons, hidden in product(
-        dict.fromkeys((found, 1, 2, 4, 8)), (16, 32, 48, 64), widths(settings, "hidden_dim"), (1, *DEPTHS)
-    ):
+    tried = [
+        (levels, *tried)
+        for levels in (tcnn_levels(most, count, log2_rows, base) for most in finest)
+        for tried in product(
+            dict.fromkeys((found, 1, 2, 4, 8)), (16, 32, 48, 64), widths(settings, "hidden_dim"), (1, *DEPTHS)
+        )
+    ]
+    for levels, features, outputs, neurons, hidden in tried:
+        rows = sum(level["rows"] for level in levels)
         shapes = tcnn.shapes_of(count * features, neurons, hidden, outputs, by_of(neurons))
         if tcnn.size_of(shapes) + (0 if apart else rows * features) == len(params) and (
             table is None or len(table) == rows * features
@@ -224,6 +269,12 @@ def tcnn_base(state: Entries, settings: Entries, finest: int, count: int, log2_r
             layers, rest = tcnn.network_of(params, shapes, count * features, outputs, 1.0 if apart else 0.0)
             return levels, tcnn.rows_of(rest if table is None else table, levels, features), layers
     raise FormatError(f"'{FIELD}{name}' has {len(params):,} numbers, which no network over its grid has")
+
+
+def tcnn_levels(finest: int, count: int, log2_rows: int, base: int) -> list[dict]:
+    """Levels that grow from one number of vertices to another."""
+    growth = np.exp((np.log(finest) - np.log(base)) / (count - 1)) if count > 1 else 1.0
+    return tcnn.levels_of(count, log2_rows, base, tcnn.single(np.log2, np.float32(growth)))
 
 
 def tcnn_head(state: Entries, settings: Entries, most: int, codes: int) -> tuple[list[Layer], int]:

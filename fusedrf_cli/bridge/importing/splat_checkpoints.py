@@ -26,7 +26,7 @@ from formats.splats.splats import (
     sigmoid,
     sizes_of,
 )
-from fusedrf_cli.bridge.importing.nerfacto import model_settings, placement_of, state_of, up_of
+from fusedrf_cli.bridge.importing.nerfacto import model_settings, named, placement_of, state_of, up_of
 from fusedrf_cli.bridge.importing.parts import Entries, Imported
 from fusedrf_cli.bridge.importing.splats import fields_of
 from fusedrf_cli.bridge.memory import Memory
@@ -136,7 +136,7 @@ def of_gsplat(checkpoint: Checkpoint) -> Splats:
 
 def of_splatfacto(checkpoint: Checkpoint, up: tuple[float, ...]) -> Splats:
     """The splats of splatfacto in the frame that it is learnt in; `up` of its capture. Raises FormatError."""
-    model = state_of(Entries(checkpoint.entries).inside("pipeline"), "_model.")
+    model = state_of(named(Entries(checkpoint.entries).inside("pipeline")), "_model.")
     own = {name.removeprefix("gauss_params."): value for name, value in model.values.items()}
     held, notes = held_by(checkpoint.path, [Entries(own, "_model: ")], SPLATFACTO), []
     if not held.rest.shape[1]:  # colours without harmonics are the sigmoid of what is learnt

@@ -13,7 +13,7 @@ from fusedrf_cli.engine.kinds.splats.device_functions import REACH
 from fusedrf_cli.engine.kinds.splats.field import SplatsField
 from fusedrf_cli.errors import InvalidInput
 
-PER_SPLAT = 1500
+PER_SPLAT = 2000
 """Bytes while a field is made of a splat, and written."""
 
 

@@ -63,12 +63,16 @@ def links_of(entries: Entries, name: str, dimensions: int, most: int) -> np.ndar
     return np.asarray(links.array() if hasattr(links, "array") else links)
 
 
-def check_rows(links: np.ndarray, count: int, name: str) -> None:
-    """Raise FormatError unless links lead to some of so many rows, and no more than are read."""
-    if count > MAX_ROWS:
-        raise LimitExceeded(f"{name} are {count:,}, more than {MAX_ROWS:,} are not read")
+def check_links(links: np.ndarray, count: int, name: str) -> None:
+    """Raise FormatError unless links lead to some of so many rows."""
     if count == 0 or links.max(initial=-1) >= count:
         raise FormatError(f"{name} should be more than the last link, {links.max(initial=-1)}, found {count}")
+
+
+def check_count(count: int, name: str) -> None:
+    """Raise LimitExceeded unless so many rows are read."""
+    if count > MAX_ROWS:
+        raise LimitExceeded(f"{name} are {count:,}, more than {MAX_ROWS:,} are not read")
 
 
 # -- the grid ------------------------------------------------------------------------------------------------
@@ -81,7 +85,11 @@ def grid_of(entries: Entries, middle: np.ndarray, radius: np.ndarray) -> Importe
     rows, counts = links[voxels], np.array(links.shape)
     del links
     density, colour = numbers_of(entries)
-    check_rows(rows, len(density), "rows of numbers")
+    check_links(rows, len(density), "rows of numbers")
+    if len(density) > MAX_ROWS:
+        voxels, rows, kept = shown_of(voxels, rows, density, counts)
+        density, colour = density[kept], colour[kept]
+    check_count(len(density), "rows of numbers")
     rgb, basis = basis_of(entries, colour.shape[1])
     box, voxel = np.concatenate([middle - radius, middle + radius]), 2 * radius / counts
     # Numbers stand for middles of voxels, and stay the same in the outer half of the last ones: with a vertex
@@ -99,6 +107,24 @@ def grid_of(entries: Entries, middle: np.ndarray, radius: np.ndarray) -> Importe
     return ImportedNode(parts_field(shape, around, resolution, values, occupancy=occupancy))
 
 
+def shown_of(
+    voxels: tuple[np.ndarray, ...], rows: np.ndarray, density: np.ndarray, counts: np.ndarray
+) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
+    """Of voxels (three (V,)) and their rows (V,) those that have a density or are next to one that has: no
+    others change anything. And which rows these are of all, by which they are numbered anew."""
+    near = np.zeros(counts, bool)
+    near[voxels] = density[rows, 0] > 0
+    for axis in range(3):
+        before = np.moveaxis(near, axis, 0).copy()
+        after = np.moveaxis(near, axis, 0)
+        after[1:] |= before[:-1]
+        after[:-1] |= before[1:]
+    held = near[voxels]
+    held[:1] |= not held.any()  # a table has a row
+    kept, rows = np.unique(rows[held], return_inverse=True)
+    return tuple(at[held] for at in voxels), rows, kept
+
+
 def numbers_of(entries: Entries) -> tuple[np.ndarray, np.ndarray]:
     """Density (M, 1) and the colours' numbers (M, 3 K), channel by channel, of the rows."""
     if "data" in entries.values:  # of the first version
@@ -111,6 +137,8 @@ def numbers_of(entries: Entries) -> tuple[np.ndarray, np.ndarray]:
 def basis_of(entries: Entries, columns: int) -> tuple[dict, dict[str, np.ndarray]]:
     """What makes colours of so many numbers a row: the entry of a shape, and sections."""
     kind = entries.whole("basis_type", 0, 255, SH)
+    if "basis_data" in entries.values and kind == SH:  # of before types were stored
+        kind = TEXTURE
     if kind == SH:
         if columns not in (3, 12, 27, 48):
             raise FormatError(f"'sh_data' should have 3, 12, 27 or 48 numbers a row, found {columns}")
@@ -187,7 +215,8 @@ def background_of(entries: Entries, middle: np.ndarray, radius: np.ndarray) -> I
     if links.max() < 0:
         return None
     data = entries.array("background_data", None, None, 4)
-    check_rows(links, len(data), "columns of 'background_data'")
+    check_links(links, len(data), "columns of 'background_data'")
+    check_count(len(data), "columns of 'background_data'")
     layers = data.shape[1]
     if not 1 <= layers <= MAX_TEXELS // 8:
         raise FormatError(f"'background_data' should have up to {MAX_TEXELS // 8} layers, found {layers}")

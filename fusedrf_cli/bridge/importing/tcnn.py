@@ -55,23 +55,25 @@ def network_of(
     return layers, params
 
 
-def levels_of(count: int, log2_rows: int, base: int, log2_growth: float, dense: bool = False) -> list[dict]:
-    """The levels of a grid, whose scales are computed in float32, as there; dense: every vertex has a row."""
+def levels_of(count: int, log2_rows: int, base: int, log2_growth: float, kind: str = "hash") -> list[dict]:
+    """The levels of a grid, whose scales are computed in float32, as there. Its vertices share rows by a
+    hash, each has its own ("dense"), or as many have as the coarsest level has, over and over ("tiled")."""
     if not 1 <= count <= 32 or not 1 <= log2_rows <= 26 or not 1 <= base <= 1 << 16:
         raise FormatError(
             f"a hash grid of {count} levels, 2^{log2_rows} rows and {base} vertices is not read"
         )
-    levels = []
+    levels, most = [], {"hash": 1 << log2_rows, "tiled": base**3}.get(kind)
     for level in range(count):
         grown = single(np.exp2, np.float32(level) * np.float32(log2_growth))
         scale = grown * np.float32(base) - np.float32(1)
         side = int(np.ceil(scale)) + 1
-        rows = padded(side**3, 8) if dense else min(padded(side**3, 8), 1 << log2_rows)
+        rows = padded(side**3, 8) if most is None else min(padded(side**3, 8), most)
         if rows > 1 << 26:
             raise FormatError(f"a grid of {side} vertices along an axis, each with a row, is not read")
-        levels.append(
-            {"scale": float(scale), "side": side, "rows": rows, "hashed": hashes(side, rows), "offset": 0.5}
-        )
+        if kind == "tiled" and side * side > rows:  # of which the last axis would not count
+            raise FormatError(f"a tiled grid of {side} vertices along an axis in {rows:,} rows is not read")
+        hashed = kind == "hash" and hashes(side, rows)
+        levels.append({"scale": float(scale), "side": side, "rows": rows, "hashed": hashed, "offset": 0.5})
     return levels
 
 

@@ -1,6 +1,6 @@
-"""Checkpoints of torch-ngp (github.com/ashawkey/torch-ngp), and of PVD (Fang et al., AAAI 2023), which is
-built on it: hash grids, planes and lines, networks, volumes. Its networks may be torch's, or those of its own
-fused kernels or of tiny-cuda-nn, which are one array each."""
+"""Checkpoints of torch-ngp (github.com/ashawkey/torch-ngp) with CCNeRF, and of PVD (Fang et al., AAAI 2023),
+which is built on it: hash grids, planes and lines, networks, volumes. Its networks may be torch's, or those
+of its own fused kernels or of tiny-cuda-nn, which are one array each."""
 
 import itertools
 import operator
@@ -25,6 +25,7 @@ from fusedrf_cli.bridge.importing.parts import (
     ranks_filled,
     trunk_layers,
 )
+from fusedrf_cli.engine.fields.box import MAX_TEXELS
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsShape
 
@@ -44,8 +45,8 @@ FRAME = (
 )
 EMA = "its moving averages (ema) are left out, as the system's own rendering does"
 RECIPE = (
-    "what it exponentiates, and colour features of planes, are taken to be kept between -2 and 7, as PVD's "
-    "options do by default"
+    "no args.txt lies beside it: what it exponentiates, and colour features of planes, are taken to be kept "
+    "between -2 and 7, as PVD does by default where it distills"
 )
 
 
@@ -53,41 +54,65 @@ def read(checkpoint) -> Imported:
     """The field of a checkpoint of torch-ngp. Raises FormatError."""
     model = Entries(checkpoint.entries).inside("model")
     if "basis_mat.weight" in model.values:
-        return planes(checkpoint, model, "waves", EXPONENTS)
+        return planes(checkpoint, model, "waves", EXPONENTS, None)
+    if "U_vec_density.0" in model.values:
+        return products(checkpoint, model)
     return hashed(checkpoint, model, EXPONENTS)
 
 
 def read_pvd(checkpoint) -> Imported:
     """The field of a checkpoint of PVD. Raises FormatError."""
     model = Entries(checkpoint.entries).inside("model")
+    settings = checkpoint.beside.get("args.txt")
+    limits, of_colours = limits_of(Entries(settings or {}, "args.txt: "))
     if "encoder.embeddings" in model.values:
-        made = hashed(checkpoint, model, LIMITS)
+        made = hashed(checkpoint, model, limits)
     elif "tensor_volume.0" in model.values:
-        made = volume(checkpoint, model)
+        made = volume(checkpoint, model, of_planes(settings, limits))
     elif "sigma_mat.0" in model.values:
-        made = planes(checkpoint, model, "harmonics", LIMITS)
+        made = planes(checkpoint, model, "harmonics", of_planes(settings, limits), of_colours)
     else:
-        made = network(checkpoint, model)
-    return replace(made, notes=[*made.notes, RECIPE])
+        made = network(checkpoint, model, limits)
+    return made if settings else replace(made, notes=[*made.notes, RECIPE])
+
+
+def limits_of(settings: Entries) -> tuple[tuple[float, float], tuple[float, float] | None]:
+    """Between which PVD keeps what it exponentiates, and the colour features of planes: those of a model that
+    was learnt from photos as they are."""
+    limits = tuple(
+        settings.number(f"sigma_clip_{end}", default)
+        for end, default in zip(("min", "max"), LIMITS, strict=True)
+    )
+    if not limits[0] < limits[1]:
+        raise FormatError(f"args.txt: 'sigma_clip_min' should be below 'sigma_clip_max', found {limits}")
+    kept = max(limits[0], EXPONENTS[0]), min(limits[1], EXPONENTS[1])
+    return kept, None if settings.values.get("just_train_a_model") else limits
+
+
+def of_planes(settings: dict | None, limits: tuple[float, float]) -> tuple[float, float]:
+    """What is exponentiated of planes and volumes: of edited ones as little as there may be."""
+    edited = (settings or {}).get("enable_edit_plenoxel")
+    return (EXPONENTS[0], limits[1]) if edited else limits
 
 
 def hashed(checkpoint, model: Entries, limits: tuple[float, float]) -> Imported:
     """A hash grid, a trunk and a colour network."""
-    bound = bound_of(model)
+    bound, said = bound_of(model), []
     if "encoder.params" in model.values:
         growth = 2 ** (np.log2(FINEST * bound / BASE) / (LEVELS - 1))
         levels = tcnn.levels_of(LEVELS, LOG2_ROWS, BASE, tcnn.single(np.log2, np.float32(growth)))
         rows = tcnn.rows_of(halves(model, "encoder.params"), levels, FEATURES)
     else:
         rows, offsets = model.array("encoder.embeddings", None, None), model.array("encoder.offsets", None)
-        levels = levels_of(offsets.astype(np.int64), len(rows), bound)
+        levels, said = levels_of(offsets.astype(np.int64), len(rows), bound)
     encoding = {"part": "hash_grid", "features": rows.shape[1], "levels": levels}
     count = len(levels) * rows.shape[1]
     sigma, sections = trunk_layers(layers_of(model, "sigma_net", count, OUTPUTS), eight(count), limits=limits)
     rgb, colours = harmonic_network(model, sigma["outputs"])
     shape = PartsShape(encoding, {"part": "trunk_features"}, sigma, rgb)
     values = {"density_rows": rows} | sections | colours
-    return finished(checkpoint, model, shape, cube_of(bound), None, values)
+    made = finished(checkpoint, model, shape, cube_of(bound), None, values)
+    return replace(made, notes=[*made.notes, *said])
 
 
 def layers_of(model: Entries, name: str, inputs: int, outputs: int) -> list[Layer]:
@@ -110,9 +135,12 @@ def halves(model: Entries, name: str) -> np.ndarray:
     return model.array(name, None).astype(np.float16).astype(np.float32)
 
 
-def planes(checkpoint, model: Entries, seen: str, limits: tuple[float, float]) -> Imported:
+def planes(
+    checkpoint, model: Entries, seen: str, limits: tuple[float, float], of_colours: tuple[float, float] | None
+) -> Imported:
     """Planes and lines, or lines alone, and a colour network of what a matrix makes of them and of the
-    direction, `seen` as "harmonics" (PVD) or with "waves" of both (torch-ngp's TensoRF)."""
+    direction, `seen` as "harmonics" (PVD) or with "waves" of both (torch-ngp's TensoRF). Between limits are
+    kept what is exponentiated, and the features of colours."""
     crossed = "sigma_mat.0" in model.values
     density, resolution, _ = factors(model, "sigma", crossed)
     colour, colour_resolution, ranks = factors(model, "color", crossed)
@@ -147,12 +175,80 @@ def planes(checkpoint, model: Entries, seen: str, limits: tuple[float, float]) -
     part = "plane_line" if crossed else "line"
     encodings = [{"part": part, "rank": made["line_0"].shape[-1]} for made in (density, colour)]
     sigma = {"part": "density_sum", "activation": "exp", "limits": list(limits)}
-    rgb |= {"limits": list(limits)} if seen == "harmonics" else {}
+    rgb |= {} if of_colours is None else {"limits": list(of_colours)}
     shape = PartsShape(*encodings, sigma, rgb)
     return finished(checkpoint, model, shape, box, resolution, values)
 
 
-def volume(checkpoint, model: Entries) -> Imported:
+def products(checkpoint, model: Entries) -> Imported:
+    """Weighted sums of products of three lines and of three planes (CCNeRF, Tang et al., NeurIPS 2022), for
+    the density and for the colours' harmonics. Beside the last texels they fall to 0."""
+    if "T_1" in model.values:
+        raise FormatError("a scene composed of several objects is not read; import each, and compose them")
+    texels = [model.array(f"U_vec_density.{2 - axis}", 1, None, None, 1).shape[2] for axis in range(3)]
+    density, weights = factors_of(model, "_density", texels)
+    colour, basis = factors_of(model, "", texels)
+    coefficients, rest = divmod(len(basis), 3)
+    if len(weights) != 1 or rest or coefficients not in (1, 4, 9, 16):
+        raise FormatError(
+            f"'S_vec_density.0' and 'S_vec.0' should have 1 and 3 times 1, 4, 9 or 16 rows, found "
+            f"{len(weights)} and {len(basis)}"
+        )
+    counts = np.array(texels) + 2
+    box, margin = around_cube(box_of(model, "aabb_train"), texels, cube_of(bound_of(model)))
+    encodings = [
+        {"part": "planes", "features": eight(made["line_0_0"].shape[-1]), "scales": [counts.tolist()],
+         "lines": True, "margin": margin}
+        for made in (density, colour)
+    ]  # fmt: skip
+    resolution = np.ceil(counts / (1 - 2 * margin)).clip(2, MAX_TEXELS).astype(int).tolist()
+    sigma = {"part": "density_linear", "activation": "exp", "limits": list(EXPONENTS)}
+    shape = PartsShape(*encodings, sigma, {"part": "sh_basis", "coefficients": coefficients})
+    values = {f"density_{name}": value for name, value in density.items()}
+    values |= {f"colour_{name}": value for name, value in colour.items()}
+    values |= {"sigma_weights": weights[0], "rgb_basis": basis.reshape(3, coefficients, -1)}
+    return finished(checkpoint, model, shape, box, resolution, values)
+
+
+def around_cube(box: np.ndarray, texels: Sequence[int], cube: np.ndarray) -> tuple[np.ndarray, float]:
+    """A box (6,) that a cube (6,) lies in, and the share of its sides that lies outside of texels over
+    another box, whose faces are faces of texels, and one more on each side."""
+    middle, half = (box[:3] + box[3:]) / 2, (box[3:] - box[:3]) / 2
+    half = half * (np.array(texels) + 1) / texels
+    wider = max(1.0, float((np.maximum(cube[3:] - middle, middle - cube[:3]) / half).max()))
+    margin = min((1 - 1 / wider) / 2, 0.49)
+    half = half / (1 - 2 * margin)
+    return np.concatenate([middle - half, middle + half]), margin
+
+
+def factors_of(model: Entries, which: str, texels: Sequence[int]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Planes and lines by the names of our sections, with a texel of 0 around, and the weights (outputs,
+    ranks) of their products: of lines first, whose planes are 1, and then of planes, whose lines are 1."""
+    weights, found = {}, {}
+    for part in ("vec", "mat"):
+        groups = range(sum(str(name).startswith(f"S_{part}{which}.") for name in model.values))
+        weights[part] = [model.array(f"S_{part}{which}.{k}", None, None) for k in groups]
+        for i, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
+            shape = (texels[2 - i], 1) if part == "vec" else (texels[b], texels[a])
+            names = [f"U_{part}{which}.{3 * k + i}" for k in groups]
+            sizes = [weight.shape[1] for weight in weights[part]]
+            held = [model.array(name, 1, n, *shape)[0] for name, n in zip(names, sizes, strict=True)]
+            found[part, i] = np.concatenate([np.zeros((0, *shape), np.float32), *held])
+    every = [*weights["vec"], *weights["mat"]]
+    if len({len(weight) for weight in every}) != 1:
+        raise FormatError(f"'S_vec{which}.*' and 'S_mat{which}.*' should have as many rows")
+    made = {}
+    for i in range(3):
+        line = np.pad(found["vec", i][..., 0].T, [(1, 1), (0, 0)])
+        plane = np.pad(found["mat", i].transpose(2, 1, 0), [(1, 1), (1, 1), (0, 0)])
+        ones = [np.ones((*at.shape[:-1], n), np.float32)
+                for at, n in ((line, plane.shape[-1]), (plane, line.shape[-1]))]  # fmt: skip
+        made[f"line_0_{2 - i}"] = np.concatenate([line, ones[0]], -1)
+        made[f"plane_0_{i}"] = np.concatenate([ones[1], plane], -1)
+    return made, np.concatenate(every, 1)
+
+
+def volume(checkpoint, model: Entries, limits: tuple[float, float]) -> Imported:
     """A grid of density and spherical harmonics."""
     grid = model.array("tensor_volume.0", 1, None, None, None, None)[0].transpose(3, 2, 1, 0)
     coefficients, rest = divmod(grid.shape[-1] - 1, 3)
@@ -162,7 +258,7 @@ def volume(checkpoint, model: Entries) -> Imported:
         )
     shape = PartsShape(
         {"part": "grid", "numbers": 1}, {"part": "grid", "numbers": 3 * coefficients},
-        {"part": "density_sum", "activation": "exp", "limits": LIMITS},
+        {"part": "density_sum", "activation": "exp", "limits": list(limits)},
         {"part": "sh", "coefficients": coefficients},
     )  # fmt: skip
     box, around = with_zeros(box_of(model, "aabb_train"), grid.shape[:3], cube_of(bound_of(model)))
@@ -171,14 +267,14 @@ def volume(checkpoint, model: Entries) -> Imported:
     return finished(checkpoint, model, shape, box, grid.shape[:3], values)
 
 
-def network(checkpoint, model: Entries) -> Imported:
+def network(checkpoint, model: Entries, limits: tuple[float, float]) -> Imported:
     """NeRF's network, in front of the trunk."""
     layers, trunk = model.layers("nerf_mlp."), model.layers("sigma_net.")
     frequencies = frequencies_of(layers[0][0].shape[1])
     # its last layer has no activation, and goes with the trunk's first
     layers = [*layers[:-1], joined(layers[-1], trunk[0]), *trunk[1:]]
     sigma, sections = skipping(layers, frequencies, hidden_first=False)
-    sigma |= {"activation": "exp", "limits": list(LIMITS)}
+    sigma |= {"activation": "exp", "limits": list(limits)}
     rgb, colours = harmonic_network(model, sigma["outputs"])
     encoding = {"part": "frequencies", "count": frequencies, "frame": True}
     shape = PartsShape(encoding, {"part": "trunk_features"}, sigma, rgb)
@@ -246,19 +342,40 @@ def box_of(model: Entries, name: str) -> np.ndarray:
     return box
 
 
-def levels_of(offsets: np.ndarray, rows: int, bound: float) -> list[dict]:
-    """The levels of torch-ngp's grid: rows of one vertex more than tiny-cuda-nn's. Scales are computed in
-    float32, as there: the finest is a whole number but for rounding."""
-    count = len(offsets) - 1
-    if count < 1 or offsets[0] != 0 or offsets[-1] != rows or (np.diff(offsets) <= 0).any():
+def levels_of(offsets: np.ndarray, rows: int, bound: float) -> tuple[list[dict], list[str]]:
+    """The levels of torch-ngp's grid, and what is to be said: how many rows levels have tells how fast they
+    grow. Its own networks' finest level has 2048 vertices for each unit of the bound, others' differ."""
+    if not 2 <= len(offsets) <= 33 or offsets[0] != 0 or offsets[-1] != rows or (np.diff(offsets) <= 0).any():
         raise FormatError(f"'encoder.offsets' should count up to {rows} rows, found {offsets.tolist()[:40]}")
-    growth = np.float32(np.log2(2 ** (np.log2(FINEST * bound / BASE) / max(count - 1, 1))))
-    levels = []
-    for level, held in enumerate(np.diff(offsets)):
+    held = np.diff(offsets).tolist()
+    if levels := grown_to(FINEST * bound, held):
+        return levels, []
+    others = {n * by for n in (FINEST // 4, FINEST // 2, FINEST, 2 * FINEST, 4 * FINEST) for by in (1, bound)}
+    others |= {BASE * 2 ** (len(held) - 1)}  # twice at each level, as before that was an option
+    fitting = {finest: levels for finest in sorted(others) if (levels := grown_to(finest, held))}
+    if len(fitting) != 1:
+        raise FormatError(
+            f"'encoder.offsets' should count the rows of a grid of {BASE} to {FINEST * bound:g} vertices "
+            f"along an axis, found another's: {offsets.tolist()[:40]}"
+        )
+    ((finest, levels),) = fitting.items()
+    return levels, [f"its grid's finest level is taken to have {finest:g} vertices, as rows of others tell"]
+
+
+def grown_to(finest: float, held: Sequence[int]) -> list[dict]:
+    """Levels with one vertex more along an axis than tiny-cuda-nn's, up to a finest one, of which each holds
+    so many rows: of all its vertices, perhaps up to a run of eight, or as many as the largest; none where
+    that is not so. Scales are computed in float32, as there: the finest is whole but for rounding."""
+    power = 2 ** (np.log2(finest / BASE) / max(len(held) - 1, 1))
+    growth, levels = np.float32(np.log2(power)), []
+    for level, rows in enumerate(held):
         scale = tcnn.single(np.exp2, np.float32(level) * growth) * np.float32(BASE) - np.float32(1)
-        side, held = int(np.ceil(scale)) + 2, int(held)
-        found = tcnn.hashes(side, held)
-        levels.append({"scale": float(scale), "side": side, "rows": held, "hashed": found, "offset": 0.5})
+        side = int(np.ceil(scale)) + 2
+        sizes = [n**3 for n in (side, int(np.ceil(BASE * power**level)) + 1)]
+        if rows not in (*sizes, *map(eight, sizes)) and not (rows == max(held) and rows < min(sizes)):
+            return []
+        found = tcnn.hashes(side, rows)
+        levels.append({"scale": float(scale), "side": side, "rows": rows, "hashed": found, "offset": 0.5})
     return levels
 
 

@@ -26,22 +26,22 @@ def harmonics(d: np.ndarray) -> np.ndarray:
 
 def grid(
     u: np.ndarray, tables: list[np.ndarray], scales: list[float], sides: list[int], offset: float = 0.5,
-    always: bool = False,
+    always: bool = False, never: bool = False,
 ) -> np.ndarray:  # fmt: skip
     """(N, L F) features at points u (N, 3) of the unit cube: a table (rows, F) a level; always: hashed,
-    however few vertices there are."""
+    however few vertices there are; never: not hashed, however many."""
     features = []
     for table, scale, side in zip(tables, scales, sides, strict=True):
         at = u * scale + offset
         cell, total = np.floor(at), 0.0
         for corner in itertools.product((0, 1), repeat=3):
             weight = np.where(corner, at - cell, 1 - (at - cell)).prod(1)
-            total = total + weight[:, None] * table[rows_at(cell + corner, side, len(table), always)]
+            total = total + weight[:, None] * table[rows_at(cell + corner, side, len(table), always, never)]
         features.append(total)
     return np.concatenate(features, 1)
 
 
-def rows_at(vertices: np.ndarray, side: int, rows: int, always: bool) -> np.ndarray:
+def rows_at(vertices: np.ndarray, side: int, rows: int, always: bool, never: bool) -> np.ndarray:
     """The row (N,) of each vertex (N, 3), counted in 32 bits as the kernels do."""
     made = []
     for x, y, z in vertices.astype(int).tolist():
@@ -49,7 +49,7 @@ def rows_at(vertices: np.ndarray, side: int, rows: int, always: bool) -> np.ndar
         for n in (x, y, z):
             if stride <= rows:
                 index, stride = (index + n * stride) % 2**32, stride * side % 2**32
-        if always or rows < stride:
+        if always or rows < stride and not never:
             index = x ^ (y * 2654435761 % 2**32) ^ (z * 805459861 % 2**32)
         made.append(index % rows)
     return np.array(made)

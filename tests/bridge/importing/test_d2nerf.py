@@ -314,6 +314,51 @@ def test_shadows_of_other_skips_are_refused(tmp_path):
         d2nerf.read(written(model, tmp_path, change), BOX, 1)
 
 
+GIN = """
+# Macros:
+# ==============================================================================
+hyper_point_min_deg = 0
+
+# Parameters for DecomposeNerfModel:
+# ==============================================================================
+DecomposeNerfModel.activation = @jax.nn.relu
+DecomposeNerfModel.blend_mode = 'add'
+DecomposeNerfModel.hyper_point_min_deg = %hyper_point_min_deg
+DecomposeNerfModel.norm_type = 'none'
+DecomposeNerfModel.sigma_activation = \\
+    @jax.nn.softplus
+NerfModel.norm_type = 'layer'
+SE3Field.use_pivot = False
+StaticNerfModel.norm_type = None
+"""
+
+
+def test_settings_as_gin_writes_them_are_read(tmp_path):
+    (tmp_path / "config.gin").write_text(GIN)
+    model = MODELS["as run"]
+    imported, (points, dirs) = d2nerf.read(written(model, tmp_path), BOX, 3), samples()
+    expected = answers(model, parameters(model), points, dirs, 3)
+    np.testing.assert_allclose(
+        asked(imported.nodes[1], points, dirs)[0], expected["sigma_dynamic"], rtol=1e-4
+    )
+
+
+@pytest.mark.parametrize(
+    "said, other, found",
+    [
+        ("Model.norm_type = 'none'", "Model.norm_type = 'layer'", "'DecomposeNerfModel.norm_type' should be"),
+        ("@jax.nn.relu", "@jax.nn.elu", "'DecomposeNerfModel.activation' should be relu, found @jax.nn.elu"),
+        ("'add'", "'nsff'", "'DecomposeNerfModel.blend_mode' should be add, found nsff"),
+        ("deg = 0", "deg = -1", "'hyper_point_min_deg' should be 0, found -1"),
+        ("use_pivot = False", "use_pivot = True", "'SE3Field.use_pivot' should be False, found True"),
+    ],
+)
+def test_settings_by_which_networks_compute_otherwise_are_refused(said, other, found, tmp_path):
+    (tmp_path / "config.gin").write_text(GIN.replace(said, other, 1))
+    with pytest.raises(FormatError, match=f"config.gin: {found}"):
+        d2nerf.read(written(MODELS["as run"], tmp_path), BOX)
+
+
 def test_the_command_writes_a_group_whose_densities_add_up(tmp_path):
     written(MODELS["as run"], tmp_path)
     box, out = ",".join(map(str, BOX)), str(tmp_path / "a.rfpack")

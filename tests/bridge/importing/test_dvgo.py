@@ -2,7 +2,7 @@
 
 import re
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -49,6 +49,10 @@ class Model:
     shell: float = 0.2
     bare: bool = False
     """As before there were classes of grids."""
+    points: int | None = None
+    """posbase_pe of the first version, whose colours read the point."""
+    implicit: bool = False
+    """rgbnet_full_implicit of the first version, whose colours read no grid."""
 
 
 MODELS = {
@@ -75,6 +79,12 @@ MODELS = {
     ),
     "without classes": Model(bare=True),
     "without classes, coarse": Model(bare=True, channels=0, mask=None),
+    "first version": Model(bare=True, mask=None, direct=False, points=5),
+    "first version, direct": Model(bare=True, mask=None, points=5, width=20, depth=4),
+    "first version, more frequencies of the direction": Model(bare=True, mask=None, points=2, views=3),
+    "first version, the point alone": Model(bare=True, mask=None, points=0, channels=7),
+    "first version, direction alone": Model(bare=True, mask=None, points=4, views=0, direct=False),
+    "first version, no features": Model(bare=True, mask=None, points=5, implicit=True),
 }
 
 
@@ -112,10 +122,13 @@ def state_of(model: Model) -> OrderedDict:
     if not model.bare:
         state["act_shift"] = torch.tensor([SHIFT])
     grid("density", 1, model.density_ranks, 2.0)
-    grid("k0", model.channels or 3, model.colour_ranks, 1.0)
+    grid("k0", 0 if model.implicit else model.channels or 3, model.colour_ranks, 1.0)
     if model.channels:
+        read = model.channels * (not model.implicit) - 3 * (not model.direct) + 3 + 6 * model.views
+        if model.points is not None:
+            state["posfreq"] = torch.FloatTensor([2**i for i in range(model.points)])
+            read += 3 + 6 * model.points
         state["viewfreq"] = torch.tensor([2.0**i for i in range(model.views)])
-        read = model.channels - 3 * (not model.direct) + 3 + 6 * model.views
         layer(state, "rgbnet.0", read, model.width)
         for i in range(model.depth - 2):
             layer(state, f"rgbnet.{i + 2}.0", model.width, model.width)
@@ -135,8 +148,8 @@ def kwargs_of(model: Model) -> dict:
         "xyz_min": low, "xyz_max": high, "num_voxels": int(np.prod(model.size)), "num_voxels_base": 500,
         "alpha_init": 0.15, "voxel_size_ratio": torch.tensor(1.3), "mask_cache_path": "./coarse_last.tar",
         "mask_cache_thres": 1e-3, "fast_color_thres": 1e-4, "rgbnet_dim": model.channels,
-        "rgbnet_direct": model.direct, "rgbnet_full_implicit": False, "rgbnet_depth": model.depth,
-        "rgbnet_width": model.width, "viewbase_pe": model.views,
+        "rgbnet_direct": model.direct, "rgbnet_full_implicit": model.implicit, "rgbnet_depth": model.depth,
+        "rgbnet_width": model.width, "viewbase_pe": model.views, "posbase_pe": model.points or 5,
     }  # fmt: skip
 
 
@@ -192,13 +205,14 @@ def contracted(model: Model, x: np.ndarray) -> np.ndarray:
     return np.where(norm[:, None] <= 1, x, x / outside * ((1 + model.shell) - model.shell / outside))
 
 
-def expected(model: Model, points: np.ndarray, dirs: np.ndarray, shift: float = SHIFT):
+def expected(model: Model, points: np.ndarray, dirs: np.ndarray):
     """(σ, rgb) of DirectVoxGO.forward and DirectContractedVoxGO.forward, σ per length of the world: what it
     is per length of the grid's space times how long that is, by differences."""
     state, (low, high) = state_of(model), box_of(model).astype(np.float64)
     p = contracted(model, points)
     at = (p - low) / (high - low)
     base = ((high - low).prod() / 500) ** (1 / 3)
+    shift = np.log(1 / (1 - 0.15) - 1) if model.bare else SHIFT
     sigma = softplus(of_grid(state, "density", at)[:, 0] + shift) / base
     h = 1e-6
     sigma *= np.linalg.norm(
@@ -213,8 +227,12 @@ def expected(model: Model, points: np.ndarray, dirs: np.ndarray, shift: float = 
     k0 = of_grid(state, "k0", at)
     if not model.channels:
         return sigma, sigmoid(k0)
-    angles = (dirs[..., None] * 2.0 ** np.arange(model.views)).reshape(len(dirs), -1)
-    h = np.concatenate([k0 if model.direct else k0[:, 3:], dirs, np.sin(angles), np.cos(angles)], 1)
+    read = [k0 if model.direct else k0[:, 3:]]
+    for x, levels in ((at, model.points), (dirs, model.views)):
+        if levels is not None:
+            angles = (x[..., None] * 2.0 ** np.arange(levels)).reshape(len(x), -1)
+            read += [x, np.sin(angles), np.cos(angles)]
+    h = np.concatenate(read, 1)
     for name in ["0", *(f"{i + 2}.0" for i in range(model.depth - 2))]:
         h = rectified(dense(state, f"rgbnet.{name}", h))
     logits = dense(state, f"rgbnet.{model.depth}", h)
@@ -236,14 +254,13 @@ def points_around(model: Model, count: int = 400) -> np.ndarray:
 def test_a_model_answers_as_dvgo(model, tmp_path):
     points, dirs = points_around(model), directions(400)
     imported = dvgo.read(open_checkpoint(saved(model, tmp_path)))
-    shift = float(np.log(1 / (1 - 0.15) - 1)) if model.bare else SHIFT
-    wanted = expected(model, points, dirs, shift)
+    wanted = expected(model, points, dirs)
     assert_equal(answers(imported.nodes[0], points, dirs), wanted, both=model.contracted is None)
     assert not imported.notes
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["indirect", "contracted by l2"])
+@pytest.mark.parametrize("name", ["indirect", "contracted by l2", "first version"])
 def test_the_compiled_loops_answer_so_as_well(name, tmp_path):
     model, dirs = MODELS[name], directions(400)
     points = points_around(model)
@@ -261,13 +278,62 @@ def test_vertices_that_the_first_version_masks_are_taken_as_they_are(tmp_path):
         held["model_state_dict"]["nonempty_mask"] = torch.from_numpy(mask[None, None])
 
     imported = dvgo.read(open_checkpoint(saved(model, tmp_path, masked)))
-    sigma, rgb = expected(model, points, dirs, float(np.log(1 / (1 - 0.15) - 1)))
+    sigma, rgb = expected(model, points, dirs)
     low = np.floor((points - BOX[0]) / (BOX[1] - BOX[0]) * (np.array(model.size) - 1)).astype(int)
     corners = low[:, None] + np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
     inside = ((corners >= 0) & (corners < model.size)).all((1, 2))
     kept = mask[tuple(np.moveaxis(np.clip(corners, 0, np.array(model.size) - 1), 2, 0))].any(1)
     assert_equal(answers(imported.nodes[0], points, dirs), (np.where(inside & kept, sigma, 0), rgb))
     assert imported.notes == [dvgo.MASK]
+
+
+def coarse_mask(shape: tuple[int, int, int], low: np.ndarray, high: np.ndarray):
+    """Densities of a first version's coarse stage, as MaskCache has them, and which points its forward keeps:
+    a ball."""
+    at = np.stack(
+        np.meshgrid(*(np.linspace(a, b, n) for a, b, n in zip(low, high, shape, strict=True)), indexing="ij"),
+        -1,
+    )
+    density = np.float32(12 - 10 * np.linalg.norm(at - BOX.mean(0), axis=-1))
+    density = torch.nn.functional.max_pool3d(torch.from_numpy(density)[None, None], 3, 1, 1)
+    shift = np.log(1 / (1 - 1e-6) - 1)
+
+    def keeps(points: np.ndarray) -> np.ndarray:
+        at = torch.from_numpy((points.astype(np.float64) - low) / (high - low) * 2 - 1)
+        grid = at[None, None, None].flip(-1)
+        raw = torch.nn.functional.grid_sample(density.double(), grid, align_corners=True)[0, 0, 0, 0]
+        return 1 - np.exp(-softplus(raw.numpy() + shift)) >= 1e-3
+
+    return density, keeps
+
+
+@pytest.mark.parametrize("size", [(7, 5, 9), (41, 47, 44)])
+def test_a_mask_of_coarse_densities_is_taken_in_fine_cells(size, tmp_path):
+    """As well as cells are fine; that it is so is said."""
+    model = replace(MODELS["first version"], size=size)
+    low, high = BOX[0] - np.float32(0.1), BOX[1] + np.float32([0.1, 0.2, -0.3])
+    density, keeps = coarse_mask((11, 13, 12), low, high)
+    vertices = np.meshgrid(*(np.linspace(a, b, n) for a, b, n in zip(*BOX, size, strict=True)), indexing="ij")
+    held = keeps(np.stack(vertices, -1).reshape(-1, 3)).reshape(size)
+
+    def masked(held_file: dict) -> None:
+        state = held_file["model_state_dict"]
+        state |= {"mask_cache.density": density, "nonempty_mask": torch.from_numpy(held[None, None])}
+        state |= {f"mask_cache.xyz_{n}": torch.from_numpy(at) for n, at in (("min", low), ("max", high))}
+
+    imported = dvgo.read(open_checkpoint(saved(model, tmp_path, masked)))
+    points, dirs = BOX[0] + (BOX[1] - BOX[0]) * np.random.default_rng(3).random((4000, 3)), directions(4000)
+    found, (sigma, _) = answers(imported.nodes[0], points, dirs)[0], expected(model, points, dirs)
+    wanted = np.where(keeps(points), sigma, 0)
+    assert (wanted > 0).mean() > 0.03 and (wanted == 0).mean() > 0.3
+    assert np.isclose(found, wanted, rtol=1e-4).mean() > 0.99
+    assert imported.notes == [dvgo.CELLS]
+
+
+def test_a_tensorf_grid_whose_colours_read_the_point_is_none(tmp_path):
+    path = saved(MODELS["TensoRF grids"], tmp_path, in_state(posfreq=2.0 ** torch.arange(5)))
+    with pytest.raises(FormatError, match="colours of a TensoRF grid should not read the point"):
+        dvgo.read(open_checkpoint(path))
 
 
 def test_a_contraction_whose_norm_is_not_said_is_the_later_ones(tmp_path):
@@ -323,8 +389,9 @@ BROKEN = {
     "a mask of no scale": (in_state(mask_cache__xyz2ijk_scale=torch.zeros(3)), "should be above 0"),
     "a flat mask": (in_state(mask_cache__mask=torch.ones(7, 5)), "'mask_cache.mask' should have shape"),
     "NaN": (with_nan, "'k0.grid' holds NaN"),
-    "colours of no grid": (in_kwargs(rgbnet_full_implicit=True), "'rgbnet_full_implicit' of DVGO's first"),
-    "colours of the point": (in_state(posfreq=torch.ones(5)), "'posbase_pe' of DVGO's first version is not"),
+    "odd frequencies of the point": (in_state(posfreq=torch.ones(5)), "'posfreq' should be 1, 2, 4 and"),
+    "a point that no layer reads": (in_state(posfreq=2 ** torch.arange(5)), "should read 69 num.* found 39"),
+    "an earlier forward-facing scene": (in_kwargs(mpi_depth=128), "of DVGO .NDC., which is not read; its de"),
     "nearest vertices": (in_kwargs(nearest=True), "'nearest' of DVGO's first version is not taken over"),
     "no radius": (in_state(scene_center=torch.zeros(3), scene_radius=torch.zeros(3)), "cube up to 1 to 2"),
     "planes in device coordinates": (in_state(act_shift__grid=torch.zeros(1, 1, 1, 1, 9)), "a camera"),

@@ -63,6 +63,8 @@ SNAPSHOTS = {
     "aabb_scale 128": Snapshot(aabb_scale=128, levels=3),
     "a growth of its own": Snapshot(growth=1.6, base=5),
     "every vertex": Snapshot(grid="DenseGrid", growth=1.5, base=4),
+    "tiled, each level alike": Snapshot(grid="TiledGrid", levels=2, features=8, base=9, growth=1.0),
+    "tiled": Snapshot(grid="TiledGrid", growth=1.3, base=9),
     "a base that follows": Snapshot(base=None, log2_rows=10),
     "Cutlass": Snapshot(cutlass=True, neurons=24),
     "outputs that are filled up": Snapshot(outputs=5),
@@ -115,7 +117,7 @@ def levels_of(made: Snapshot) -> tuple[list[float], list[int], list[int]]:
     log2 = single(math.log2(growth))
     scales = [float(single(single(2.0 ** float(single(n) * log2)) * base) - 1) for n in range(made.levels)]
     sides = [math.ceil(scale) + 1 for scale in scales]
-    most = 1 << (made.log2_rows if made.grid == "HashGrid" else 30)
+    most = {"HashGrid": 1 << made.log2_rows, "TiledGrid": base**3}.get(made.grid, 1 << 30)
     return scales, sides, [min(padded(side**3, 8), most) for side in sides]
 
 
@@ -216,7 +218,8 @@ def expected(made: Snapshot, points: np.ndarray, d: np.ndarray) -> tuple[np.ndar
     density, colour, tables, _ = numbers_of(made)
     scales, sides, _ = levels_of(made)
     u = (p - 0.5) / made.aabb_scale + 0.5
-    h = oracle.grid(u, [table.astype(np.float64) for table in tables], scales, sides)
+    tables = [table.astype(np.float64) for table in tables]
+    h = oracle.grid(u, tables, scales, sides, never=made.grid != "HashGrid")
     own, shading = widths_of(made)
     h = oracle.network(np.pad(h, ((0, 0), (0, own[0] - h.shape[1]))), *density)
     code = codes_of(made)[0] if made.codes else [0.0] * made.extra
@@ -274,7 +277,9 @@ def test_the_command_writes_what_it_shows(tmp_path):
     [
         ("network", None, "'network' is missing"),
         ("network.activation", "Sine", "'activation' should be ReLU, found 'Sine'"),
-        ("encoding.otype", "Frequency", "'otype' should be HashGrid or DenseGrid"),
+        ("encoding.otype", "Frequency", "'otype' should be HashGrid, DenseGrid or Ti"),
+        ("encoding.hash", "ReversedPrime", "'hash' should be CoherentPrime, found 'ReversedPrime'"),
+        ("encoding.type", "Tiled", "a tiled grid of"),
         ("encoding.interpolation", "Smoothstep", "'interpolation' should be Linear"),
         ("encoding.n_levels", 99, "'n_levels' should be a whole number from 1 to 32, found 99"),
         ("dir_encoding.nested", [{"otype": "Frequency"}], "SphericalHarmonics of degree 4, found Frequency"),

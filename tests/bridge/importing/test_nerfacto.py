@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -34,7 +34,8 @@ class Run:
     """Hidden ones of both networks."""
     wide: tuple[int, int] = (16, 16)
     codes: int = 4
-    average: bool = True
+    average: bool | None = True
+    """None: before that was a setting."""
     contracted: bool = True
     density: float | None = 0.01
     config: bool = True
@@ -42,6 +43,8 @@ class Run:
     transforms: bool = True
     marched: bool = False
     """Whether it is nerfstudio's instant-ngp."""
+    contraction: int | None = None
+    """And if it is of before April 2023, its contraction."""
 
 
 RUNS = {
@@ -67,8 +70,32 @@ RUNS = {
     "of 2022": Run(tcnn=True, layout="before", density=None, config=False, wide=(64, 64)),
     "without transforms": Run(transforms=False),
     "nerfstudio's instant-ngp": Run(tcnn=True, codes=0, density=None, marched=True),
+    "its codes": Run(tcnn=True, codes=32, average=None, density=None, marched=True),
+    "its codes without settings": Run(tcnn=True, average=False, density=None, marched=True, config=False),
+    "its of 2022": Run(tcnn=True, layout="before", codes=0, density=None, marched=True, contraction=2),
+    "its of 2022, codes": Run(
+        tcnn=True, layout="before", codes=32, average=None, density=None, marched=True, contraction=2
+    ),
+    "its of 2022, in a box": Run(
+        tcnn=True, layout="before", codes=0, density=None, marched=True, contraction=0, contracted=False
+    ),
+    "its first": Run(
+        tcnn=True,
+        layout="before",
+        codes=0,
+        density=None,
+        marched=True,
+        contraction=2,
+        config=False,
+        finest=4096,
+    ),
+    "of October 2022": Run(tcnn=True, layout="before", density=None, average=None, finest=1024),
+    "before codes were averaged": Run(average=None, density=None),
 }
+NGP = Run(tcnn=True, layout="before", codes=0, density=None, marched=True, contraction=1, levels=16,
+          log2_rows=19, finest=2048)  # fmt: skip
 BOX = np.array([[-1.0, -1.5, -0.5], [1.5, 1.0, 1.0]], np.float32)
+CUBE = np.array([[-0.5, -0.25, -0.75], [1.0, 1.25, 0.75]], np.float32)
 SCALE, TURN = 0.4, 0.7
 SHIFT = np.array([0.3, -0.2, 0.1])
 FRAME = np.array([[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]]) @ np.array(
@@ -130,12 +157,13 @@ def state_of(run: Run) -> dict[str, np.ndarray]:
     """The state of a pipeline."""
     own, head, tables, codes = numbers_of(run)
     table = np.concatenate(tables)
-    field = {"aabb": BOX}
+    field = {"aabb": BOX if run.contraction is None else CUBE}
     if run.layout != "before":
         field |= {"max_res": np.int64(run.finest), "num_levels": np.int64(run.levels)}
         field["log2_hashmap_size"] = np.int64(run.log2_rows)
     if run.codes:
-        field["embedding_appearance.embedding.weight"] = codes.astype(np.float32)
+        name = "embedding_appearance" if run.contraction is None else "appearance_embedding"
+        field[f"{name}.embedding.weight"] = codes.astype(np.float32)
     named = {
         ("now", True): "mlp_base.model.params", ("before", True): "mlp_base.params",
         ("now", False): ("mlp_base.model.0.hash_table", "mlp_base.model.1.layers"),
@@ -157,7 +185,12 @@ def state_of(run: Run) -> dict[str, np.ndarray]:
         field |= {f"mlp_head.layers.{i}.weight": weight for i, (weight, _) in enumerate(head)}
         field |= {f"mlp_head.layers.{i}.bias": bias for i, (_, bias) in enumerate(head)}
     state = {f"field.{name}": value for name, value in field.items()}
-    state["occupancy_grid.aabbs" if run.marched else "proposal_networks.0.aabb"] = BOX
+    if run.contraction is not None:
+        state |= {
+            "occupancy_grid._roi_aabb": CUBE.reshape(6),
+            "occupancy_grid._binary": np.ones((2, 2, 2), bool),
+        }
+    state["occupancy_grid.occs" if run.marched else "proposal_networks.0.aabb"] = BOX
     state["field.mlp_pred_normals.layers.0.weight"] = BOX
     state["camera_optimizer.pose_adjustment"] = np.zeros((9, 6), np.float32)
     return {run.prefix + name: value for name, value in state.items()}
@@ -174,10 +207,13 @@ def written(run: Run, folder, **changed):
     settings = {
         "base_res": run.base, "features_per_level": run.features, "hidden_dim": run.wide[0],
         "hidden_dim_color": run.wide[1], "appearance_embed_dim": run.codes,
-        "use_average_appearance_embedding": run.average, "disable_scene_contraction": not run.contracted,
+        "use_average_appearance_embedding": run.average, "average_init_density": run.density,
+        "disable_scene_contraction": None if run.contraction is not None else not run.contracted,
     }  # fmt: skip
-    settings |= {} if run.density is None else {"average_init_density": run.density}
-    lines = "".join(f"    {name}: {json.dumps(value)}\n" for name, value in settings.items())
+    lines = "".join(f"    {n}: {json.dumps(value)}\n" for n, value in settings.items() if value is not None)
+    if run.contraction is not None:
+        lines += "    contraction_type: &id001 !!python/object/apply:nerfacc.contraction.ContractionType\n"
+        lines += f"    - {run.contraction}\n"
     if run.config:
         (folder / "config.yml").write_text(
             "!!python/object:nerfstudio.engine.trainer.TrainerConfig\n"
@@ -219,7 +255,13 @@ def expected(run: Run, points: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, n
     scale = SCALE if run.transforms else 1.0
     x = scale * (points @ FRAME.T + SHIFT) if run.transforms else points
     d = d @ FRAME.T if run.transforms else d
-    if run.contracted:
+    if run.contraction == 2:
+        x = (x - CUBE[0]) / (CUBE[1] - CUBE[0]) * 2 - 1
+        length = np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-9)
+        u = np.where(length < 1, x, (2 - 1 / length) * x / length) / 4 + 0.5
+    elif run.contraction == 0:
+        u = (x - CUBE[0]) / (CUBE[1] - CUBE[0])
+    elif run.contracted:
         most = np.maximum(np.abs(x).max(1, keepdims=True), 1e-9)
         u = (np.where(most < 1, x, (2 - 1 / most) * x / most) + 2) / 4
     else:
@@ -254,7 +296,8 @@ def places(run: Run, count: int = 150) -> tuple[np.ndarray, np.ndarray]:
 def test_nerfacto(name, tmp_path):
     run, (points, d) = RUNS[name], places(RUNS[name])
     if run.layout == "before":  # of the sizes that it was written with
-        run = Run(**{**run.__dict__, "levels": 16, "finest": 2048, "log2_rows": 19})
+        finest = 2048 if run.finest < 1024 else run.finest
+        run = Run(**{**run.__dict__, "levels": 16, "finest": finest, "log2_rows": 19})
     checkpoint = written(run, tmp_path)
     assert checkpoint.system == "nerfacto"
     imported = nerfacto.read(checkpoint)
@@ -262,6 +305,7 @@ def test_nerfacto(name, tmp_path):
     said = " ".join(imported.notes)
     assert ("no config.yml" in said) == (not run.config)
     assert ("sampled everywhere" in said) == run.marched
+    assert ("around a ball" in said) == (run.contraction is not None and not run.config)
     assert ("no dataparser_transforms.json" in said) == (not run.transforms)
     assert ("their mean" in said) == bool(run.codes and run.average)
     assert ("fixed to 0" in said) == bool(run.codes and not run.average)
@@ -290,6 +334,8 @@ def test_the_command_writes_it(tmp_path):
         (Run(tcnn=True), {"mlp_base.model.params": np.zeros(99)}, "99 numbers, which no network"),
         (Run(tcnn=True), {"mlp_head.tcnn_encoding.params": np.zeros(99)}, "no network over its features has"),
         (Run(contracted=False), {"aabb": np.zeros((2, 3))}, "three minima below three maxima"),
+        (NGP, {}, "should be 2, of a ball, or 0, of a box, found 1"),
+        (replace(NGP, contraction=2), {"aabb": BOX}, "the box in a contracted scene should be a cube"),
         (Run(density=-1.0), {}, "'average_init_density' should be above 0, found -1"),
     ],
 )  # fmt: skip

@@ -244,6 +244,33 @@ def test_a_field_comes_back_from_its_file_as_it_was(tmp_path):
             assert torch.equal(back.params, node.field.params)
 
 
+def test_a_texture_of_before_types_were_stored_is_one(tmp_path):
+    entries = entries_of(SAVED["texture"])
+    del entries["basis_type"]
+    points, dirs = asked(entries, 100, 1.2)
+    found = answers(svox2.read(write(tmp_path / "a.npz", entries)).nodes[0], points, dirs)
+    agree(found, of_all(inside_of, entries, points, dirs))
+
+
+def test_of_more_rows_than_are_read_those_that_show_nothing_are_left_out(tmp_path, monkeypatch):
+    entries = entries_of(SAVED["harmonics"])
+    empty = entries["links"][:2], entries["links"][2:, :, 5:]
+    for links in empty:
+        entries["density_data"][links[links >= 0]] *= -np.sign(entries["density_data"][links[links >= 0]])
+    checkpoint, count = write(tmp_path / "a.npz", entries), len(entries["density_data"])
+    monkeypatch.setattr(svox2, "MAX_ROWS", count - 20)
+    (node,) = svox2.read(checkpoint).nodes
+    assert node.field.shape.density["rows"] < count - 20
+    points, dirs = asked(entries, 300, 1.2)
+    agree(answers(node, points, dirs), of_all(inside_of, entries, points, dirs))
+    monkeypatch.setattr(svox2, "MAX_ROWS", 50)
+    with pytest.raises(LimitExceeded, match="more than 50 are not read"):
+        svox2.read(checkpoint)
+    entries["density_data"] = -abs(entries["density_data"])
+    (node,) = svox2.read(write(tmp_path / "a.npz", entries)).nodes
+    assert not node.field.occupancy.occupied.any()
+
+
 def test_a_forward_facing_scene_is_said_to_lie_in_ndc(tmp_path):
     (tmp_path / "args.json").write_text('{"dataset_type": "llff", "near_clip": 0.0}')
     imported = svox2.read(write(tmp_path / "ckpt.npz", entries_of(SAVED["harmonics"])))

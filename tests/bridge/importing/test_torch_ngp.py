@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from formats.errors import FormatError
 from formats.foreign.systems import open_checkpoint
 from fusedrf_cli import verbs
 from fusedrf_cli.bridge.importing import torch_ngp
@@ -27,6 +28,8 @@ class Model:
     features: int = 2
     rounded: bool = True
     """Whether rows of a level are a multiple of eight, as newer versions have them."""
+    finest: float = 2048
+    """desired_resolution for each unit of the bound."""
     networks: str = "torch"
     layers: tuple[int, int] = (2, 3)
     shown: tuple[float, ...] = ()
@@ -35,6 +38,9 @@ class Model:
     cells: bool = True
     frequencies: int = 3
     degree: int = 3
+    clip: tuple[float, float] = (-2, 7)
+    args: dict = field(default_factory=dict)
+    """Of PVD's args.txt; none where that is not there."""
     more: tuple[str, ...] = field(default=())
 
 
@@ -44,6 +50,9 @@ MODELS = {
     "bound 16, 3 levels": Model(bound=16, levels=3, features=1),
     "bound 4, without cells": Model(bound=4, cells=False, more=("ema",)),
     "rows as there are vertices": Model(log2_rows=14, rounded=False),
+    "a coarser grid": Model(finest=512, levels=16, log2_rows=15),
+    "a grid whatever the bound": Model(bound=4, finest=512, levels=16, log2_rows=15, more=("ema",)),
+    "twice at each level": Model(bound=2, finest=16 * 2**6 / 2, levels=7, log2_rows=19, rounded=False),
     "deeper": Model(layers=(4, 2), more=("bg_net.0.weight",)),
     "cut": Model(bound=2, shown=(-1.0, -0.5, -2.0, 1.5, 2.0, 0.25)),
     "cut to a smaller cube": Model(bound=2, shown=(-1.0,) * 3 + (1.0,) * 3),
@@ -59,6 +68,15 @@ PVD = {
     "vm": Model("vm", trained=(-0.75, -1.0, -0.5, 1.0, 0.75, 1.0)),
     "tensors": Model("tensors"),
     "tensors of degree 2": Model("tensors", degree=2, bound=2),
+    "hash, clipped": Model(levels=14, clip=(-1.5, 1), args={"sigma_clip_min": -1.5, "sigma_clip_max": 1}),
+    "mlp, clipped": Model("mlp", clip=(-0.5, 0.5), args={"sigma_clip_min": -0.5, "sigma_clip_max": 0.5}),
+    "vm, clipped": Model("vm", clip=(-0.5, 0.5), args={"sigma_clip_min": -0.5, "sigma_clip_max": 0.5}),
+    "vm of photos": Model(
+        "vm", clip=(-1, 1), args={"sigma_clip_min": -1.0, "sigma_clip_max": 1.0, "just_train_a_model": True}
+    ),
+    "vm, edited": Model("vm", args={"enable_edit_plenoxel": True}),
+    "tensors, edited": Model("tensors", args={"enable_edit_plenoxel": True}),
+    "tensors, clipped": Model("tensors", clip=(-1, 1e3), args={"sigma_clip_min": -1, "sigma_clip_max": 1e3}),
 }
 
 
@@ -74,7 +92,7 @@ def matrices(rng, inputs: int, outputs: int, layers: int, wide: int = 16) -> lis
 
 def scales_of(model: Model, extra: int) -> tuple[list[float], list[int]]:
     """Scales and vertices along an axis of the levels; extra: beyond one more than its scale rounded up."""
-    growth = 2 ** (np.log2(2048 * model.bound / 16) / (model.levels - 1))
+    growth = 2 ** (np.log2(model.finest * model.bound / 16) / (model.levels - 1))
     growth = np.float32(np.log2(float(np.float32(growth)) if model.networks == "tcnn" else growth))
     scales = [float(np.float32(2.0 ** float(np.float32(n) * growth) * 16) - 1) for n in range(model.levels)]
     return scales, [int(np.ceil(scale)) + 1 + extra for scale in scales]
@@ -150,6 +168,11 @@ def written(model: Model, folder, pvd: bool = False, **changed):
     """A checkpoint, opened."""
     state = state_of(model, pvd) | changed
     state = {name: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for name, v in state.items()}
+    if model.args:
+        given = sorted(({"PE": 10, "stage_iters": {"stage1": 2000}, "ckpt": "a=b"} | model.args).items())
+        (folder / "args.txt").write_text("".join(f"{pair}\n" for pair in given) + "\npsnr: 31.20 \nssim: 0.9")
+        folder = folder / "checkpoints"
+        folder.mkdir()
     file = {"epoch": 3, "global_step": 1000, "stats": {"loss": [0.1], "checkpoints": []}, "model": state}
     if model.cells:
         file |= {"mean_count": 2345, "mean_density": 5.4}
@@ -198,7 +221,7 @@ def waves(x: np.ndarray, count: int) -> np.ndarray:
 
 def expected(model: Model, state: dict, points: np.ndarray, d: np.ndarray, pvd: bool):
     """σ and rgb by the system's own formulas, in the cells that it samples."""
-    low, high = (-2, 7) if pvd else (-np.inf, np.inf)
+    low, high = model.clip if pvd else (-np.inf, np.inf)
     box = state["aabb_train"].astype(np.float64)
     x, read = 2 * (points - box[:3]) / (box[3:] - box[:3]) - 1, oracle.harmonics(d)
     if model.kind == "tensors":
@@ -209,7 +232,8 @@ def expected(model: Model, state: dict, points: np.ndarray, d: np.ndarray, pvd: 
         raw = multiplied(state, "sigma", x, model.kind).sum(1)
         features = multiplied(state, "color", x, model.kind) @ state["basis_mat.weight"].T
         if pvd:
-            read = np.concatenate([read, features.clip(low, high)], 1)
+            features = features if model.args.get("just_train_a_model") else features.clip(low, high)
+            read = np.concatenate([read, features], 1)
         else:
             read = np.concatenate([waves(features, model.frequencies), waves(d, model.frequencies)], 1)
         rgb = oracle.network(read, *layers_in(state, "color_net", []))
@@ -235,6 +259,7 @@ def expected(model: Model, state: dict, points: np.ndarray, d: np.ndarray, pvd: 
         filler = np.ones((len(h), 1)) if model.networks == "tcnn" else np.zeros((len(h), 1))
         read = np.concatenate([read, h[:, 1:], *([filler] if model.networks != "torch" else [])], 1)
         rgb = oracle.network(read, *layers_in(state, "color_net", [32, 64, 64, 16]))[:, :3]
+    low = -100 if model.args.get("enable_edit_plenoxel") else low
     sigma = np.exp(raw.clip(low, high))
     inside = (np.abs(points) <= model.bound).all(1)
     inside &= ((points >= state["aabb_infer"][:3]) & (points < state["aabb_infer"][3:])).all(1)
@@ -261,6 +286,7 @@ def test_torch_ngp(name, tmp_path):
     oracle.assert_alike(oracle.answers(imported, points, d), expected(model, state, points, d, False))
     said = " ".join(imported.notes)
     assert ("moving averages" in said) == ("ema" in model.more)
+    assert ("finest level is taken to have" in said) == (model.finest != 2048)
     assert ("behind the scene" in said) == ("bg_net.0.weight" in model.more)
     assert ("is cut to" in said) == bool(model.shown)
 
@@ -273,7 +299,13 @@ def test_pvd(name, tmp_path):
     imported = torch_ngp.read_pvd(checkpoint)
     found = oracle.answers(imported, points, d)
     oracle.assert_alike(found, expected(model, state_of(model, True), points, d, True))
-    assert any("between -2 and 7" in note for note in imported.notes)
+    assert any("between -2 and 7" in note for note in imported.notes) == (not model.args)
+
+
+def test_limits_of_pvd_that_are_none_are_named(tmp_path):
+    checkpoint = written(Model("tensors", args={"sigma_clip_min": 7}), tmp_path, True)
+    with pytest.raises(FormatError, match="'sigma_clip_min' should be below 'sigma_clip_max'"):
+        torch_ngp.read_pvd(checkpoint)
 
 
 def test_the_command_writes_what_it_shows(tmp_path):
@@ -292,6 +324,7 @@ def test_the_command_writes_what_it_shows(tmp_path):
     [
         ({"color_net.0.weight": None}, "'color_net.0.weight'"),
         ({"encoder.embeddings": np.zeros((9, 2), np.float32)}, "'encoder.offsets' should count up to 9 rows"),
+        ({"encoder.offsets": np.array([0, 32, 96, 192, 256], np.int32)}, "rows of a grid of 16 to 2048 ver"),
         ({"sigma_net.0.weight": np.zeros((16, 9), np.float32)}, "a network should read at most 8 features"),
         ({"sigma_net.1.weight": np.full((16, 16), np.nan, np.float32)}, "holds NaN or infinity"),
         ({"aabb_infer": np.zeros(6, np.float32)}, "three minima below three maxima"),

@@ -173,6 +173,10 @@ BESIDE = {
     "dvgo": {"config.py": "data = dict(datadir='./x', inverse_y=False)\nbase = os.system('touch x')\n"},
     "d2nerf": {"options.json": '{"use_shadow_model": true}'},
     "svox2": {"args.json": '{"background_brightness": 0.5}'},
+    "pvd": {
+        "args.txt": "('PE', 10)\n('ckpt', 'a=b')\n('stage_iters', {'stage1': -1})\n('f', open('x'))\n"
+        "('odd',)\n('steps', [1e10])\n\npsnr: 30.12 \nssim: 0.95\n"
+    },
     "krrish-nerf": {"config.yml": "models: {coarse: {num_layers: 4}}\n"},
 }
 

@@ -41,6 +41,12 @@ def test_lines_and_literals(tmp_path):
     assert read(tmp_path, "config.gin", lines) == expected
 
 
+def test_lines_of_pairs(tmp_path):
+    assert read(tmp_path, "args.txt", BESIDE["pvd"]["args.txt"]) == {
+        "PE": 10, "ckpt": "a=b", "stage_iters": {"stage1": -1}, "steps": [1e10],
+    }  # fmt: skip
+
+
 def test_python_is_parsed_and_never_run(tmp_path):
     assert read(tmp_path, "config.py", BESIDE["k-planes"]["config.py"]) == {
         "config": {"density_activation": "trunc_exp", "reso": [1, 2], "a": -1}
