@@ -47,6 +47,9 @@ class BuilderConfig:
     """Seconds of learning from which it is told more still, in proportion, ..."""
     most_patient: float = 2.0
     """... up to so many times: the same four after five minutes 34.8 dB without, 36.0 with it."""
+    most_shown: float = 12.0
+    """Times the rays of a lesson of pictures alone, which are rendered quickly, where there is time: a chair
+    of `cp` in `dense` 39.8 dB by one lesson, 42.2 by six."""
 
 
 EACH = "each"  # in place of a precision: every field of a scene has one of its own
@@ -296,17 +299,23 @@ class DistilledBuilder:
     def distil_config_for(self, numbers: int, seconds: float | None = None) -> DistilConfig | None:
         """How a student of so many numbers learns, in so many seconds where they are given: the more numbers
         there are, the more it is told, up to `most_told` times, and where there is time for more than that,
-        up to `most_patient` times of this; but no more than there is time to learn from."""
-        config = current(BuilderConfig)
-        if not self.learnt or self.distil_config is None:
-            return self.distil_config and replace(self.distil_config, time_budget=seconds)
+        up to `most_patient` times of this; but no more than there is time to learn from. What only finishes
+        on pictures is shown more of them where there is time."""
+        config, lesson = current(BuilderConfig), self.distil_config
+        if lesson is None:
+            return None
+        if not self.learnt:
+            rays = lesson.rays
+            if seconds is not None and not lesson.steps:
+                rays = round(min(max(rays, config.rays_per_second * seconds), config.most_shown * rays))
+            return replace(lesson, rays=rays, time_budget=seconds)
         more = min(max(1.0, numbers / config.told_numbers), config.most_told)
         if seconds is not None:
             more *= min(max(1.0, seconds / config.patient), config.most_patient)
-        rays, steps = round(more * self.distil_config.rays), round(more * self.distil_config.steps)
+        rays, steps = round(more * lesson.rays), round(more * lesson.steps)
         if seconds is not None:
             rays = min(rays, int(config.rays_per_second * seconds) + 1)
-        return replace(self.distil_config, rays=rays, steps=steps, time_budget=seconds)
+        return replace(lesson, rays=rays, steps=steps, time_budget=seconds)
 
     def unchanged(self) -> "Candidate | None":
         """The scene itself, where nothing of it is to be changed; None where a student stands for it."""
