@@ -84,3 +84,17 @@ def test_too_few_bytes_make_nothing():
     student = asked(ComposedField([placed(ball())]))
     assert student.build(student.plain(), 100) is None
     assert student.smallest() > 100
+
+
+def test_the_longer_it_learns_the_more_pictures_it_is_shown():
+    """By 40,000 rays a second, from one lesson to twelve; without a time budget one lesson."""
+    student = asked(moved_vm())
+    told = [student.distil_config_for(1000, seconds).rays for seconds in (None, 1.0, 60.0, 3600.0)]
+    assert told == [400_000, 400_000, 2_400_000, 4_800_000]
+    assert student.distil_config_for(1000, 60.0).time_budget == 60.0
+
+
+def test_kinds_on_vertices_are_known():
+    """Without making a field: `convert` lets these grow larger."""
+    on_vertices = {kind.name for kind in registry.kinds() if kind.on_vertices}
+    assert on_vertices == {"dense", "dense-mlp"}
