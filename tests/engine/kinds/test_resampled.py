@@ -87,11 +87,13 @@ def test_too_few_bytes_make_nothing():
 
 
 def test_the_longer_it_learns_the_more_pictures_it_is_shown():
-    """By 40,000 rays a second, from one lesson to twelve; without a time budget one lesson."""
+    """By 40,000 rays a second, from one lesson to twelve, at up to five times the rate; without a time budget
+    one lesson."""
     student = asked(moved_vm())
-    told = [student.distil_config_for(1000, seconds).rays for seconds in (None, 1.0, 60.0, 3600.0)]
-    assert told == [400_000, 400_000, 2_400_000, 4_800_000]
-    assert student.distil_config_for(1000, 60.0).time_budget == 60.0
+    told = [student.distil_config_for(1000, seconds) for seconds in (None, 1.0, 20.0, 60.0, 3600.0)]
+    assert [config.rays for config in told] == [400_000, 400_000, 800_000, 2_400_000, 4_800_000]
+    rates = [config.rgb_rate / told[0].rgb_rate for config in told]
+    assert rates == pytest.approx([1, 1, 2, 5, 5]) and told[3].time_budget == 60.0
 
 
 def test_kinds_on_vertices_are_known():
