@@ -125,6 +125,11 @@ fused_max_size = click.option(
     type=BytesType(),
     help="Largest output file; default: 25MB, and what unbounded sources take.",
 )
+converted_max_size = click.option(
+    "--max-size",
+    type=BytesType(),
+    help="Largest output file; default: 25MB, of dense and dense-mlp 50MB, and what unbounded sources take.",
+)
 extracted_max_size = click.option(
     "--max-size",
     type=BytesType(),

@@ -12,7 +12,7 @@ from fusedrf_cli.option_types import FieldKindType, InputType
 @click.option(
     "--kind", type=FieldKindType(), required=True, help="Kind of field to make; see `fusedrf kinds`."
 )
-@options.max_size
+@options.converted_max_size
 @options.smallest
 @options.fused_time_budget
 @options.memory
