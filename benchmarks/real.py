@@ -54,7 +54,7 @@ QUALITY = 80
 """Of JPEG: some 20 kB a picture."""
 ABOUT = (
     "Written by `make bench-real`; rows that a run leaves out stay, each with its *commit*. "
-    f"Every {EVERY}th photo is held out; *kind* is what `train` takes for so many minutes. "
+    f"Every {EVERY}th photo is held out; *kind* is what `train` took at that commit. "
     "PSNR is the mean over those photos, "
     "in the pixels that masks keep; *corrected* is after the affine map of colours that suits each photo "
     "best, which the photo itself tells; *gap* is the training PSNR less the held-out one; *mean colour* and "

@@ -164,14 +164,14 @@ def unusable_kind(error: ValueError) -> FusedRFError:
 
 def refuse_options(kind: Kind, request: FuseRequest | TrainRequest) -> None:
     """UsageProblem for an option that a kind does not heed."""
-    for word, option in OPTIONS.items():
-        if getattr(request, word) is not None and word not in kind.takes:
-            raise UsageProblem(f"{option} does not apply to kind '{kind.name}'; leave it out")
+    for option in unheeded(kind, request):
+        raise UsageProblem(f"{option} does not apply to kind '{kind.name}'; leave it out")
 
 
-def takes_options(kind: Kind, request: TrainRequest) -> bool:
-    """Whether a kind heeds all options that are given."""
-    return all(word in kind.takes for word in OPTIONS if getattr(request, word) is not None)
+def unheeded(kind: Kind, request: FuseRequest | TrainRequest) -> list[str]:
+    """The options that are given and that a kind does not heed."""
+    given = {word: option for word, option in OPTIONS.items() if getattr(request, word) is not None}
+    return [option for word, option in given.items() if word not in kind.takes]
 
 
 def note_options(request: FuseRequest, loaded: LoadedScene, progress) -> None:

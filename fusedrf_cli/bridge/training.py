@@ -11,7 +11,7 @@ from formats.views import Capture, check_parallax, hold_out
 from fusedrf_cli.bridge.memory import decoding, fitting, photos
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.posing import posed_capture
-from fusedrf_cli.bridge.scene import refuse_options, takes_options, unusable_kind
+from fusedrf_cli.bridge.scene import refuse_options, unheeded, unusable_kind
 from fusedrf_cli.bridge.scene_bounds import SceneBounds
 from fusedrf_cli.bridge.sizes import BundleSizes, HeaderConfig, section_bytes
 from fusedrf_cli.engine.distillation.config import TrainConfig
@@ -95,7 +95,7 @@ def usual_kind(request: TrainRequest, unbounded: bool, device: str) -> str:
         return registry.SHARING
     budget = scaled_budget(request.time_budget, device)
     patient = budget >= current(TrainPresets).surroundings_from if budget else request.quality != "draft"
-    if unbounded and patient and takes_options(registry.kind(registry.SURROUNDINGS), request):
+    if unbounded and patient and not unheeded(registry.kind(registry.SURROUNDINGS), request):
         return registry.SURROUNDINGS
     return registry.DEFAULT
 

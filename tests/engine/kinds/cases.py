@@ -67,3 +67,25 @@ KINDS = {
 }
 BOXED = [name for name in registry.names() if isinstance(registry.kind(name), BoxKind) and name not in KINDS]
 KINDS |= {name: partial(random_boxed, name) for name in BOXED}
+
+
+HOSTILE_ROWS = {
+    "too few bits": ("_blocks", lambda a: a[:-1], "told by a bit"),
+    "other bits": ("_blocks", np.zeros_like, "should be told"),
+    "an empty block": ("_held", np.zeros_like, "none is"),
+    "other rows": ("_held", lambda a: a ^ np.uint8(255), "none is|the runs of|beyond|should have shape"),
+    "masks of another type": ("_held", lambda a: a.astype(np.int32), "should be told"),
+    "no masks": ("_held", None, "should have shape"),
+    "other runs": (".runs", lambda a: a[::-1] + np.uint8(1), "the runs of"),
+    "fewer numbers": ("", lambda a: a[:-1], "should have shape"),
+}
+"""What may be wrong with the arrays of held rows: which of them, what becomes of it, and what is said."""
+
+
+def damaged_rows(arrays: dict[str, np.ndarray], name: str, wrong: str) -> str:
+    """Damage the arrays of the held rows of a name; what is to be said."""
+    which, change, said = HOSTILE_ROWS[wrong]
+    array = arrays.pop(name + which)
+    if change is not None:
+        arrays[name + which] = change(array)
+    return said

@@ -36,7 +36,7 @@ from fusedrf_cli.engine.settings import using
 from fusedrf_cli.engine.spaces.bounded import STEP_PER_VOXEL
 
 from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, points_in, random_vm, unit
-from .cases import random_detail
+from .cases import HOSTILE_ROWS, damaged_rows, random_detail
 
 
 def asked(field, count=300, reference=False):
@@ -241,26 +241,10 @@ def test_cut_numbers_keep_the_codes_that_they_had(monkeypatch, precision):
     assert ((plane == whole) | (plane == 0)).all() and (plane != 0).any()
 
 
-HOSTILE_HELD = {
-    "too few bits": ("detail_blocks", lambda a: a[:-1], "told by a bit"),
-    "other bits": ("detail_blocks", lambda a: np.zeros_like(a), "should be told"),
-    "an empty block": ("detail_held", np.zeros_like, "none is"),
-    "other rows": ("detail_held", lambda a: a ^ np.uint8(255), "none is|the runs of|should have shape"),
-    "masks of another type": ("detail_held", lambda a: a.astype(np.int32), "should be told"),
-    "no masks": ("detail_held", lambda a: None, "should have shape"),
-    "other runs": ("detail.runs", lambda a: a[::-1] + np.uint8(1), "the runs of"),
-    "fewer numbers": ("detail", lambda a: a[:-1], "should have shape"),
-}
-
-
-@pytest.mark.parametrize("name", HOSTILE_HELD)
+@pytest.mark.parametrize("name", HOSTILE_ROWS)
 def test_held_rows_that_do_not_fit_are_refused(name):
-    which, change, said = HOSTILE_HELD[name]
     arrays, metadata = without_unqueried(sparse_detail(1 << 12, torch.float32)).state()
-    changed = change(arrays[f"tensor_0.{which}"])
-    arrays = arrays | {f"tensor_0.{which}": changed} if changed is not None else arrays
-    if changed is None:
-        del arrays[f"tensor_0.{which}"]
+    said = damaged_rows(arrays, "tensor_0.detail", name)
     with pytest.raises(ValueError, match=said):
         VMField.from_state(arrays, metadata)
 

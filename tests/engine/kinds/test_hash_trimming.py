@@ -18,7 +18,7 @@ from fusedrf_cli.engine.kinds.hash.trimming import without_unasked
 from tests.formats.spec_reader import answer
 
 from ..conftest import BOX, points_in, unit
-from .cases import random_boxed
+from .cases import HOSTILE_ROWS, damaged_rows, random_boxed
 
 HASH = registry.kind("hash")
 COARSE, FINE = HashShape(3, 4, 40, 6, 8), HashShape(3, 4, 40, 14, 8)
@@ -121,22 +121,10 @@ def test_wider_texels_leave_levels_out_of_a_file(monkeypatch, shape, precision):
     assert levels == [3, 2, 1, 1] and sizes[0] > sizes[1] > sizes[2] >= sizes[3]
 
 
-HOSTILE = {
-    "too few bits": ("_blocks", lambda a: a[:-1], "told by a bit"),
-    "an empty block": ("_held", np.zeros_like, "none is"),
-    "other rows": ("_held", lambda a: a ^ np.uint8(255), "none is|the runs of|beyond|should have shape"),
-    "no masks": ("_held", lambda a: None, "should have shape"),
-    "other runs": (".runs", lambda a: a[::-1] + np.uint8(1), "the runs of"),
-    "fewer numbers": ("", lambda a: a[:-1], "should have shape"),
-}
-
-
-@pytest.mark.parametrize("name", HOSTILE)
+@pytest.mark.parametrize("name", HOSTILE_ROWS)
 def test_held_rows_that_do_not_fit_are_refused(name):
-    which, change, said = HOSTILE[name]
     arrays, metadata = HASH.trimmed(few_cells(dtype=torch.float32)).state()
-    changed = change(arrays.pop(f"density_rows{which}"))
-    arrays |= {f"density_rows{which}": changed} if changed is not None else {}
+    said = damaged_rows(arrays, "density_rows", name)
     with pytest.raises(ValueError, match=said):
         HashField.from_state(arrays, metadata)
 
