@@ -102,7 +102,7 @@ KINDS = {  # the first whose pattern fits counts
     "splats": Kind(
         "a scene of Gaussian splats",
         "make a bundle of it with `fusedrf import`",
-        "splat ksplat spz sog sogs",
+        "splat ksplat spz sog sogs lcc lcc2 rad spx",
         rb"ply[\r\n].*(property \S+ (f_dc_0|scale_0|packed_(position|scale))\b|element chunk.*element sh\b)",
     ),
     "mesh": Kind(

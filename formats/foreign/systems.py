@@ -155,7 +155,7 @@ def _begins_as_map(head: bytes) -> bool:
 def _other_file(path: Path, head: bytes) -> FormatError:
     """The error for a file that is no checkpoint."""
     other = identify(head, path.suffix)
-    if other is None or other.kind in ("checkpoint", "archive", "text", "other"):
+    if other is None or other.kind in ("checkpoint", "text", "other"):
         return UnknownCheckpoint(f"{path}: begins as no checkpoint of a known system does; {known_systems()}")
     if other.kind == "splats":
         return UnknownCheckpoint(
@@ -167,10 +167,12 @@ def _other_file(path: Path, head: bytes) -> FormatError:
 
 
 CURES = {
+    "archive": "unpack it, and give the checkpoint or the splats in it",
     "bundle": "it needs no import: render it, or place it in a scene with `fusedrf compose`",
     "photo": "give a folder of photos to `fusedrf train`",
     "mesh": "give it to `fusedrf train`, which learns a field of it",
     "empty": "copy or export it again",
+    "usd": "of splats in it save a .ply",
 }
 
 

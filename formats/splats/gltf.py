@@ -12,7 +12,7 @@ import numpy as np
 
 from formats.errors import BadSplats, LimitExceeded, counted
 from formats.splats.placing import keeps_shapes, placed
-from formats.splats.splats import Splats, check_count, gathered
+from formats.splats.splats import Splats, check_count, gathered, joined
 from formats.splats.spz import read_spz
 from formats.surfaces import gltf_schema as schema
 from formats.surfaces.accessors import Buffers
@@ -28,6 +28,10 @@ SPZ = (
     "KHR_spz_gaussian_splats_compression",
 )
 """The newest of its drafts first."""
+PACKED_AXES = (
+    "holds SPZ, whose axes are taken for those of glTF, as CesiumJS does; by the draft of its extension the "
+    "splats would stand turned by half a turn about y"
+)
 LINEAR = "lin_rec709_display"
 DEGREES = 3
 AXES = np.diag([-1.0, -1, 1, 1])
@@ -83,7 +87,10 @@ class _Reader:
         if logarithms:
             self.notes.add("its scales are logarithms, as drafts of the extension had them; they are read so")
         sound = {key: self._sound(part, logarithms) for key, part in self.parts.items()}
-        return self._joined([self._placed(sound[key], world) for key, world in placements])
+        splats = joined(
+            self.path, "a glTF file of splats", [self._placed(sound[key], world) for key, world in placements]
+        )
+        return replace(splats, notes=self.notes.sentences() + splats.notes)
 
     def _placements(self) -> tuple[list[tuple[tuple[int, int], np.ndarray]], int]:
         """Parts of splats by their keys and where each lies, and how many primitives are something else."""
@@ -122,6 +129,7 @@ class _Reader:
         if splatting.kernel != "ellipse":
             self.notes.add(f"has the kernel {splatting.kernel[:40]!r}, and is shown as ellipses", called)
         if (packed := _packed(primitive, where)) is not None:
+            self.notes.add(PACKED_AXES, called)
             return self._unpacked(bytes(self.buffers.view(packed.buffer_view)), where)
         rows = {name: self._attribute(primitive, name, width, where) for name, width in ATTRIBUTES.items()}
         harmonics = self._harmonics(primitive, where)
@@ -187,21 +195,6 @@ class _Reader:
         if splats.harmonics.shape[1] > 1 and not keeps_shapes(world[:3, :3]):
             self.notes.add("nodes stretch splats; their colours are turned as by the nearest rotation")
         return placed(splats, AXES @ world)
-
-    def _joined(self, pieces: list[Splats]) -> Splats:
-        """With as many coefficients as any has."""
-        count = max(piece.harmonics.shape[1] for piece in pieces)
-        more = [[(0, 0), (0, count - piece.harmonics.shape[1]), (0, 0)] for piece in pieces]
-        splats = gathered(
-            self.path,
-            "a glTF file of splats",
-            centres=np.concatenate([piece.centres for piece in pieces]),
-            scales=np.concatenate([piece.scales for piece in pieces]),
-            rotations=np.concatenate([piece.rotations for piece in pieces]),
-            opacities=np.concatenate([piece.opacities for piece in pieces]),
-            harmonics=np.concatenate([np.pad(p.harmonics, w) for p, w in zip(pieces, more, strict=True)]),
-        )
-        return replace(splats, notes=self.notes.sentences() + splats.notes)
 
 
 ATTRIBUTES = {"POSITION": 3, "SCALE": 3, "ROTATION": 4, "OPACITY": 1}

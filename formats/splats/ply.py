@@ -32,8 +32,9 @@ HEADER = re.compile(
     re.DOTALL,
 )
 CHUNK = 256
-UPRIGHT = re.compile(r"comment\s+vertical axis:\s*z\s*$", re.IGNORECASE)
-"""Nerfstudio's, whose world has z up. Brush writes y, whichever way is up."""
+UPRIGHT = re.compile(r"comment\s+vertical axis:\s*(z|\S+\s+\S+\s+\S+)\s*$", re.IGNORECASE)
+"""Nerfstudio's, whose world has z up, and Brush's, which writes the direction where it was told it. Otherwise
+Brush writes y, whichever way is up."""
 FILTER = "filter_3D"
 """Of Mip-Splatting, the least size that cameras told apart (Yu et al. 2024, eq. 8)."""
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -59,8 +60,22 @@ def read_ply(path: Path | str, data: bytes) -> Splats:
     if compressed:
         columns = _Columns(path, chunks), _Columns(path, vertices), _Columns(path, rest)
         return _compressed(path, *columns, notes)
-    up = UP_Z if any(UPRIGHT.match(line) for line in lines) else DOWN_Y
-    return _plain(path, _Columns(path, vertices), up, notes)
+    return _plain(path, _Columns(path, vertices), _up(lines), notes)
+
+
+def _up(lines: list[str]) -> tuple[float, float, float]:
+    """What is up by the comments of a header."""
+    for words in (found[1].split() for found in map(UPRIGHT.match, lines) if found):
+        if len(words) == 1:
+            return UP_Z
+        try:
+            axis = np.array([float(word) for word in words])
+        except ValueError:
+            continue
+        length = np.linalg.norm(axis)
+        if 0 < length < np.inf:
+            return tuple((axis / length).tolist())
+    return DOWN_Y
 
 
 class _Columns(dict):
@@ -70,12 +85,18 @@ class _Columns(dict):
         super().__init__(columns)
         self.path = path
 
-    def rows(self, names: Sequence[str]) -> np.ndarray:
-        """(N, n) of n columns, float32 but for whole numbers."""
+    def rows(self, names: Sequence[str], kind: type = np.float32) -> np.ndarray:
+        """(N, n) of n columns of that kind; of floats any width will do."""
         for name in names:
             if not isinstance(self.get(name), np.ndarray):
                 raise BadSplats(f"{self.path}: its splats lack {name!r}; export it again")
-        kind = np.float32 if self[names[0]].dtype.kind == "f" else self[names[0]].dtype.newbyteorder("=")
+            found, wanted = self[name].dtype, np.dtype(kind)
+            fits = found.kind == wanted.kind and found.itemsize in (wanted.itemsize, 8)
+            if len(self[name]) and not fits:
+                raise BadSplats(
+                    f"{self.path}: stores {name!r} as {found.name}, expected {kind.__name__}; export it as "
+                    "3DGS does"
+                )
         return np.stack([self[name].astype(kind) for name in names], 1)
 
 
@@ -123,6 +144,10 @@ def _harmonics(path, vertices: _Columns, rest: list[str], notes: list[str]) -> n
         first = of_colours(colours[0] / colours[1])
     else:
         raise BadSplats(f"{path}: its splats lack a colour ('f_dc_0'); export it again")
+    if missing := [name for name in vertices if name.startswith("f_rest_") and name not in rest]:
+        raise BadSplats(
+            f"{path}: has {missing[0]!r}, but only {len(rest)} of those before it; export it again"
+        )
     stored, kept = coefficients_of(path, len(rest), notes)
     harmonics = np.empty((len(first), 1 + kept, 3), np.float32)
     harmonics[:, :1] = first
@@ -143,10 +168,8 @@ def _filtered(scales: np.ndarray, opacities: np.ndarray, least: np.ndarray) -> t
 
 def _compressed(path, chunks: _Columns, vertices: _Columns, rest: _Columns, notes: list[str]) -> Splats:
     """Numbers of 8 to 11 bits between the least and the largest of a chunk of 256 splats."""
-    packed = vertices.rows(PACKED)
+    packed = vertices.rows(PACKED, np.uint32)
     check_count(path, len(packed))
-    if packed.dtype != np.uint32:
-        raise BadSplats(f"{path}: packed numbers of type {packed.dtype}, expected uint; export it again")
     if len(chunks.rows(["min_x"])) != -(-len(packed) // CHUNK):
         raise BadSplats(
             f"{path}: has {len(chunks['min_x']):,} chunks for {len(packed):,} splats, expected one for "
@@ -208,11 +231,10 @@ def _with_rest(path, first: np.ndarray, rest: _Columns, notes: list[str]) -> np.
     stored, kept = coefficients_of(path, len(names), notes)
     if not kept:
         return first
-    table = rest.rows(names)
-    if table.dtype != np.uint8 or len(table) != len(first):
+    table = rest.rows(names, np.uint8)
+    if len(table) != len(first):
         raise BadSplats(
-            f"{path}: has {len(table):,} rows of harmonics of type {table.dtype} for {len(first):,} splats; "
-            "export it again"
+            f"{path}: has {len(table):,} rows of harmonics for {len(first):,} splats; export it again"
         )
     middle = (np.arange(256) + 0.5) / 256
     middle[[0, 255]] = 0, 1

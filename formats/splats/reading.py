@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from formats.splats.ply import is_ply, read_ply
 from formats.splats.sog import is_meta, is_sog, read_sog
 from formats.splats.splats import MAX_FILE, Splats
 from formats.splats.spz import is_spz, read_spz
+from formats.splats.streamed import is_index, read_streamed
 
 HEAD = max(MAX_HEADER, 1 << 17)
 """Bytes of a file that are looked at first."""
@@ -27,15 +29,47 @@ MAX_FILES = 2000
 GIVE = "a .ply of 3DGS, .spz, .sog, .splat, .ksplat or .glb"
 
 
+class Unread(NamedTuple):
+    """A format of splats that is known and not read."""
+
+    start: bytes
+    """A pattern of its first bytes."""
+    what: str
+    """With its article."""
+    cure: str
+    """What to do, as an order."""
+
+
+UNREAD = (
+    Unread(rb"RAD0", "a .rad of Spark", "give the file that it was made from"),
+    Unread(rb"spx[\1-\3]", "an .spx of Reall3D", "save it as a .ply, as by `gsbox x2p -i FILE -o new.ply`"),
+    Unread(
+        rb'\s*\{(?=.*"totalLevels?")(?=.*"totalSplats")',
+        "an .lcc of XGRIDS",
+        "save it as a .ply, as by `splat-transform FILE --select-lod 0 new.ply`",
+    ),
+    Unread(
+        rb"ply[\r\n](?=.*element codebook_centers\b)",
+        "a quantised .ply of Reduced-3DGS",
+        "give the one that it was made from",
+    ),
+    Unread(
+        rb"ply[\r\n](?=.*property \S+ f_anchor_feat_0\b)",
+        "a .ply of Scaffold-GS, of which networks make splats",
+        "give splats that need none",
+    ),
+)
+
+
 def is_splats(path: Path | str) -> bool:
-    """Whether a file holds Gaussian splats in a format that is read. Raises MissingFile, NotAFile,
-    ResourceError."""
+    """Whether a file holds Gaussian splats in a format that is read. Raises BadSplats for one of UNREAD,
+    MissingFile, NotAFile, ResourceError."""
     return _reader(path) is not None
 
 
 def read_splats(path: Path | str) -> Splats:
-    """The splats of a .ply (plain or compressed), .spz, .sog, .splat, .ksplat, .gltf or .glb. Raises
-    BadSplats, LimitExceeded, NewerVersion, MissingFile, NotAFile, ResourceError; of glTF also what
+    """The splats of a .ply (plain or compressed), .spz, .sog (streamed too), .splat, .ksplat, .gltf or .glb.
+    Raises BadSplats, LimitExceeded, NewerVersion, MissingFile, NotAFile, ResourceError; of glTF also what
     `read_gltf` raises."""
     reader = _reader(path)
     if reader is None:
@@ -45,26 +79,34 @@ def read_splats(path: Path | str) -> Splats:
 
 
 def newest_point_cloud(folder: Path | str) -> Path | None:
-    """The splats of the highest iteration in the folder of a run of 3DGS; None in any other."""
+    """The splats of the highest iteration in the folder of a run of 3DGS, or those of a folder that is a SOG;
+    None in any other."""
     places = islice(Path(folder).glob("point_cloud/iteration_*/point_cloud.ply"), MAX_FILES)
     steps = {
         int(found[1]): place
         for place in places
         if (found := re.fullmatch(r"iteration_(\d{1,18})", place.parent.name)) and is_splats(place)
     }
-    return steps[max(steps)] if steps else None
+    if steps:
+        return steps[max(steps)]
+    places = [Path(folder) / name for name in ("lod-meta.json", "meta.json")]
+    return next((place for place in places if place.is_file() and is_splats(place)), None)
 
 
 @np.errstate(all="ignore")
 def _reader(path: Path | str) -> Callable[[Path | str, bytes], Splats] | None:
     with open_input(path) as file:
         head, size = file.read(HEAD), os.fstat(file.fileno()).st_size
+    if found := next((kind for kind in UNREAD if re.match(kind.start, head, re.DOTALL)), None):
+        raise BadSplats(f"{path}: is {found.what}, which is not read; {found.cure}")
     if is_ply(head):
         return read_ply
     if is_spz(head):
         return read_spz
     if names_splats(_json(path, head)):
         return read_gltf_splats
+    if is_index(head):
+        return read_streamed
     if is_sog(path) if head.startswith(b"PK\3\4") else is_meta(head):
         return read_sog
     if is_ksplat(head, size):

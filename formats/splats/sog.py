@@ -17,13 +17,14 @@ from typing import Annotated, BinaryIO
 import msgspec
 import numpy as np
 
-from formats.errors import BadSplats, LimitExceeded, NewerVersion
+from formats.errors import BadSplats, LimitExceeded, NewerVersion, listed
 from formats.images import DECODING_ERRORS
 from formats.safe_input import open_input, parse_json
-from formats.splats.splats import ANTIALIASED, Splats, check_count, gathered, sigmoid
+from formats.splats.splats import ANTIALIASED, DISCS, Splats, check_count, gathered, sigmoid
 from formats.surfaces.named_files import Beside
 
 META = "meta.json"
+MODELS = {"antialiased": ANTIALIASED, "2dgs": DISCS}
 MAX_META = 4 << 20
 MAX_PICTURE = 1 << 29
 """Bytes of a picture as it is packed."""
@@ -45,7 +46,8 @@ UNPACKING_ERRORS = (
 Numbers3 = Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)]
 Name = Annotated[list[str], msgspec.Meta(min_length=1)]
 Names2 = Annotated[list[str], msgspec.Meta(min_length=2)]
-Codebook = Annotated[list[float | None], msgspec.Meta(min_length=256, max_length=256)]
+BOOK = 256
+Codebook = Annotated[list[float | None], msgspec.Meta(min_length=1, max_length=BOOK)]
 
 
 class Means(msgspec.Struct):
@@ -91,6 +93,7 @@ class Meta(msgspec.Struct, rename={"rest": "shN"}):
     rest: Rest | None = None
     version: int = 1
     count: int = 0
+    format: str = "sog"
     model: str = ""
     """Brush's and SplatTransform's: "antialiased", "2dgs" or nothing."""
 
@@ -120,7 +123,13 @@ def read_sog(path: Path | str, data: bytes) -> Splats:
         beside = Beside(path)
         return _read(path, data, lambda name: beside.read(name)[0])
     with _opened(path, io.BytesIO(data)) as pack:
-        found = min((name for name in pack.namelist() if name.rpartition("/")[2] == META), default=META)
+        metas = [name for name in pack.namelist() if name.rpartition("/")[2] == META]
+        if len(metas) > 1 and META not in metas:
+            raise BadSplats(
+                f"{path}: holds {len(metas)} SOGs, as a streamed one does ({listed(metas)}); unpack it, and "
+                "give its lod-meta.json, or the meta.json of one"
+            )
+        found = META if META in metas or not metas else metas[0]
         folder = found.removesuffix(META)
         meta = _member(path, pack, found, MAX_META)
         return _read(path, meta, lambda name: _member(path, pack, folder + name, MAX_PICTURE))
@@ -167,6 +176,11 @@ def _read(path: Path | str, meta: bytes, read: Callable[[str], bytes]) -> Splats
         content = msgspec.convert(parse_json(meta, f"{path}: {META}"), Meta)
     except msgspec.ValidationError as error:
         raise BadSplats(f"{path}: its {META} is not that of a SOG: {error}; export it again") from error
+    if content.format != "sog":
+        raise BadSplats(
+            f"{path}: is of the format {content.format[:40]!r}, and only SOGs that stand still are read; "
+            "save one moment of it as a .ply"
+        )
     if content.version not in (1, 2):
         raise NewerVersion(
             f"{path}: is a SOG of version {content.version}, and 1 and 2 are read; update fusedrf, or "
@@ -186,7 +200,7 @@ class _Reader:
         check_count(path, max(self.count, 0), sum(map(len, self.files.values())))
 
     def splats(self) -> Splats:
-        notes = [ANTIALIASED] if self.meta.model == "antialiased" else []
+        notes = [MODELS[self.meta.model]] if self.meta.model in MODELS else []
         colours = self._rows(self.meta.sh0.files[0])
         values = self._values(self.meta.sh0, colours[:, :3])
         opacities = sigmoid(self._range(self.meta.sh0, colours, 3)) if self.old else colours[:, 3] / 255
@@ -245,12 +259,13 @@ class _Reader:
         return values.mins[i] + (values.maxs[i] - values.mins[i]) * (picture[:, i] / 255)
 
     def _book(self, codebook: list[float | None] | None) -> np.ndarray:
-        """(256,) float64; early writers left the first entry out, which goes on evenly before the second."""
+        """(256,) float64. Early writers left the first entry out, which goes on evenly before the second; of
+        few splats they wrote as many entries as there are numbers."""
         if codebook is None or None in codebook[1:]:
             raise BadSplats(f"{self.path}: its {META} lacks a codebook; export it again")
-        if codebook[0] is None:
-            codebook = [codebook[1] + (codebook[1] - codebook[255]) / 255, *codebook[1:]]
-        return np.array(codebook, np.float64)
+        if codebook[0] is None and len(codebook) == BOOK:
+            codebook = [codebook[1] + (codebook[1] - codebook[-1]) / (BOOK - 1), *codebook[1:]]
+        return np.array([*codebook, *[None] * (BOOK - len(codebook))], np.float64)
 
     def _centres(self) -> np.ndarray:
         """(N, 3) float64: 16 bits between bounds, of sign(x) ln(1 + |x|)."""

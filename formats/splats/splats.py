@@ -1,5 +1,6 @@
 """What every reader of splats gives: Gaussians in the world of their file, with finite numbers."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,7 +66,7 @@ def gathered(
     opacities: np.ndarray,
     harmonics: np.ndarray,
     up: tuple[float, float, float] = DOWN_Y,
-    notes: list[str] | tuple[str, ...] = (),
+    notes: Sequence[str] = (),
 ) -> Splats:
     """Splats of arrays as a file holds them, shapes as in `Splats`, of which those with NaN, infinite or
     absurd numbers are left out; quaternions of any length, that of no length is no rotation. Raises BadSplats
@@ -91,6 +92,23 @@ def gathered(
         kind,
         up,
         tuple(printable(f"{path}: {note}") for note in notes),
+    )
+
+
+def joined(path: Path | str, kind: str, pieces: list[Splats], notes: Sequence[str] = ()) -> Splats:
+    """Splats of several, with as many coefficients as any has, in the first one's world. Raises BadSplats."""
+    count = max(piece.harmonics.shape[1] for piece in pieces)
+    more = [[(0, 0), (0, count - piece.harmonics.shape[1]), (0, 0)] for piece in pieces]
+    return gathered(
+        path,
+        kind,
+        centres=np.concatenate([piece.centres for piece in pieces]),
+        scales=np.concatenate([piece.scales for piece in pieces]),
+        rotations=np.concatenate([piece.rotations for piece in pieces]),
+        opacities=np.concatenate([piece.opacities for piece in pieces]),
+        harmonics=np.concatenate([np.pad(p.harmonics, w) for p, w in zip(pieces, more, strict=True)]),
+        up=pieces[0].up,
+        notes=notes,
     )
 
 
@@ -137,11 +155,13 @@ def sigmoid(logits: np.ndarray) -> np.ndarray:
 
 
 def sizes_of(logarithms: np.ndarray, notes: list[str]) -> np.ndarray:
-    """(N, 3) float64 standard deviations of (N, 2 or 3) logarithms; the third of a disc is 0."""
-    missing = 3 - logarithms.shape[1]
-    if missing:
+    """(N, 3) float64 standard deviations of (N, 1 to 3) logarithms: one is that of a ball, and the third of a
+    disc is 0."""
+    sizes = np.exp(logarithms.astype(np.float64))
+    if sizes.shape[1] == 2:
         notes.append(DISCS)
-    return np.pad(np.exp(logarithms.astype(np.float64)), [(0, 0), (0, missing)])
+        return np.pad(sizes, [(0, 0), (0, 1)])
+    return np.broadcast_to(sizes, (len(sizes), 3))
 
 
 def coefficients_of(path: Path | str, numbers: int, notes: list[str]) -> tuple[int, int]:

@@ -1,6 +1,7 @@
 """Niantic's .spz, versions 1 to 4: quantised splats, packed by gzip as a whole or by zstd in streams.
 
-https://github.com/nianticlabs/spz (README.md, load-spz.cc). Positions, rotations and harmonics are stored
+https://github.com/nianticlabs/spz (README.md, load-spz.cc); of levels of detail
+https://github.com/sparkjsdev/spark (rust/spark-lib/src/spz.rs). Positions, rotations and harmonics are stored
 with the axes right, up, back, or with those that an extension states; a .ply of the same splats has right,
 down, front. Nothing in a file tells whether its writer turned the axes, as the format asks.
 """
@@ -32,8 +33,9 @@ STREAM = struct.Struct("<QQ")
 CONTAINER = 32
 """Bytes of version 4's header."""
 LATEST = 4
-SMOOTHED, EXTENDED = 1, 2
-MAX_FRACTION = 23
+SMOOTHED, EXTENDED, LEVELLED = 1, 2, 128
+"""Flags: antialiasing, extensions, and Spark's for a tree of levels of detail."""
+MAX_FRACTION = 24
 MAX_EXTENSIONS = 1 << 20
 COLOUR = 0.15
 """What a step of 1 of the first coefficient is of the range of a byte."""
@@ -91,8 +93,11 @@ class _Packed:
         check_count(path, self.count, n_bytes)
         self.stored, self.kept = coefficients_of(path, 3 * ((degree + 1) ** 2 - 1), notes)
         self.extended = bool(flags & EXTENDED)
+        self.levelled = bool(flags & LEVELLED) and self.version < LATEST
         if flags & SMOOTHED:
             notes.append(ANTIALIASED)
+        known = SMOOTHED | EXTENDED | (LEVELLED if self.levelled else 0)
+        not_honoured([hex(1 << i) for i in range(8) if flags & ~known & 1 << i], notes, "flags")
         self.axes = RIGHT_UP_BACK
         self.arrays: dict[str, np.ndarray] = {}
 
@@ -106,7 +111,7 @@ class _Packed:
             "scales": 3,
             "rotations": 3 if self.version < 3 else 4,
             "harmonics": 3 * self.stored,
-        }
+        } | ({"children": 2, "first children": 4} if self.levelled else {})
 
     def read_extensions(self, data: bytes | memoryview) -> None:
         """Records of type and length: the one of axes is read, others are told."""
@@ -120,6 +125,15 @@ class _Packed:
             else:
                 names.append(f"0x{kind:08X}")
         not_honoured(names, self.notes, "extensions")
+
+    def keep_finest(self) -> None:
+        """Of a tree of levels of detail, what has no children: the others stand for it from afar."""
+        finest = self.arrays["children"].view("<u2") == 0
+        if not (kept := int(finest.sum())):
+            raise BadSplats(f"{self.path}: its levels of detail have no finest; export it again")
+        self.notes.append(f"holds levels of detail: {kept:,} of {self.count:,} splats, the finest, are read")
+        self.arrays = {name: self._bytes(name)[finest].reshape(-1) for name in self.arrays}
+        self.count = kept
 
     # --- what the bytes stand for ---------------------------------------------------------------------------
 
@@ -139,7 +153,7 @@ class _Packed:
             centres=self._positions() * turn,
             scales=np.exp(self._bytes("scales") / 16 - 10),
             rotations=self._rotations() * np.concatenate([[1], turn.prod() * turn]),
-            opacities=self._bytes("alphas")[:, 0] / 255,
+            opacities=np.minimum(self._bytes("alphas")[:, 0] / (127.5 if self.levelled else 255), 1),
             harmonics=harmonics,
             up=UP_Y if as_stored else DOWN_Y,
             notes=self.notes,
@@ -198,6 +212,8 @@ class _Legacy(_Packed):
             raise BadSplats(f"{path}: is cut off, or goes on behind its splats; copy or export it again")
         if self.extended:
             self.read_extensions(extensions)
+        if self.levelled:
+            self.keep_finest()
 
     def _take(self, path: Path | str, size: int) -> bytes:
         """The next bytes, fewer at the end."""

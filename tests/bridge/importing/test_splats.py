@@ -12,6 +12,7 @@ from fusedrf_cli import verbs
 from fusedrf_cli.bridge.importing.splats import shells_of
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.python import open_scene
+from tests.formats.splats.writers import content, sog_files, written, zipped
 
 
 def splat_file(path: Path, centres: np.ndarray, scale: float = 0.05) -> Path:
@@ -111,6 +112,16 @@ def test_a_time_is_said_to_be_of_no_use(tmp_path):
     file = splat_file(tmp_path / "balls.splat", np.zeros((3, 3)))
     report = verbs.import_field(file, tmp_path / "balls.rfpack", time=2.0)
     assert "nothing in it moves, and --time is not used" in report["notes"]
+
+
+def test_the_folder_of_a_sog_and_an_archive_of_splats(tmp_path):
+    for name, data in sog_files(content(4, 0)).items():
+        written(tmp_path / "scene" / name, data)
+    report = verbs.import_field(tmp_path / "scene", tmp_path / "scene.rfpack")
+    assert report["system"] == "Gaussian splats" and report["fields"][0]["kind"] == "splats"
+    packed = written(tmp_path / "scene.zip", zipped({"a/balls.splat": bytes(32)}))
+    with pytest.raises(UnknownCheckpoint, match="is an archive, no checkpoint; unpack it, and give"):
+        verbs.import_field(packed, tmp_path / "b.rfpack")
 
 
 def test_a_file_cut_short_and_a_folder_say_what_to_do(tmp_path):

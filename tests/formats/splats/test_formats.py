@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from formats.errors import BadSplats
 from formats.splats.reading import is_splats, read_splats
 from tests.formats.splats import writers
 from tests.formats.splats.writers import content, written
@@ -132,6 +133,27 @@ def test_more_splats_than_a_chunk_a_bucket_and_a_row(name, tmp_path):
 )
 def test_other_files_are_no_splats(data, tmp_path):
     assert not is_splats(written(tmp_path / "a.splat", data))
+
+
+@pytest.mark.parametrize(
+    ("data", "sentence"),
+    [
+        (b"RAD0" + bytes(200), "a .rad of Spark"),
+        (b"spx\3" + bytes(124), "an .spx of Reall3D.*gsbox x2p"),
+        (b'{ "version": "5.0", "totalSplats": 12, "totalLevel": 2}', "an .lcc of XGRIDS.*splat-transform"),
+        (b'{"totalLevels": 5, "splatType": ".sog", "totalSplats": 9}', "an .lcc of XGRIDS"),
+        (
+            writers.ply(content()).replace(b"end_header", b"element codebook_centers 256\nend_header"),
+            "a quantised .ply of Reduced-3DGS",
+        ),
+        (writers.ply(content()).replace(b"f_rest_0\n", b"f_anchor_feat_0\n"), "a .ply of Scaffold-GS"),
+    ],
+)
+def test_known_formats_that_are_not_read(data, sentence, tmp_path):
+    path = written(tmp_path / "a.splat", data)
+    for ask in (is_splats, read_splats):
+        with pytest.raises(BadSplats, match=f"is {sentence}"):
+            ask(path)
 
 
 def test_meshes_are_no_splats(tmp_path):

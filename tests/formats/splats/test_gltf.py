@@ -151,7 +151,9 @@ def test_primitives_of_several_degrees(tmp_path):
 @pytest.mark.parametrize("name", [f"{SPLATTING}_compression_spz_2", f"{SPLATTING}_compression_spz"])
 def test_spz_has_the_axes_of_its_primitive(name, tmp_path):
     expected = content(5, 3)
-    check(read(tmp_path, gltf_of_spz(expected, name)), expected, SPZ)
+    splats = read(tmp_path, gltf_of_spz(expected, name))
+    check(splats, expected, SPZ)
+    assert "as CesiumJS does" in splats.notes[0]
 
 
 def test_spz_of_the_first_draft_lies_beside(tmp_path):

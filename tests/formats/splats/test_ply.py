@@ -29,9 +29,18 @@ def test_f_rest_goes_through_a_colour_after_the_other(tmp_path):
     assert read(tmp_path, columns).harmonics[1, 1:].tolist() == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
 
 
-@pytest.mark.parametrize(("axis", "up"), [("z", (0, 0, 1)), ("y", (0, -1, 0))])
-def test_the_vertical_axis_of_nerfstudio_is_up_and_that_of_brush_says_nothing(axis, up, tmp_path):
-    assert read(tmp_path, ply_columns(content()), comment=f"Vertical Axis: {axis}").up == up
+@pytest.mark.parametrize(
+    ("axis", "up"),
+    [
+        ("z", (0, 0, 1)),  # nerfstudio's
+        ("y", (0, -1, 0)),  # Brush's, whichever way is up
+        ("0 1.5 -2", (0, 0.6, -0.8)),  # Brush's, which was told
+        ("0 0 0", (0, -1, 0)),
+        ("a b c", (0, -1, 0)),
+    ],
+)
+def test_the_vertical_axis(axis, up, tmp_path):
+    assert read(tmp_path, ply_columns(content()), comment=f"Vertical Axis: {axis}").up == pytest.approx(up)
 
 
 def test_opacities_are_logits_also_infinite_ones(tmp_path):
@@ -77,6 +86,25 @@ def test_two_axes_are_a_disc(tmp_path):
     assert "discs" in splats.notes[0]
 
 
+def test_one_axis_is_a_ball(tmp_path):
+    """As MonoGS saves isotropic splats, which it repeats for all axes."""
+    columns = {name: c for name, c in ply_columns(content()).items() if name not in ("scale_1", "scale_2")}
+    splats = read(tmp_path, columns)
+    np.testing.assert_allclose(splats.scales, content().scales[:, [0, 0, 0]], rtol=1e-6)
+    assert splats.notes == ()
+
+
+def test_numbers_of_other_types(tmp_path):
+    """Doubles are read; whole numbers stand for something that the file does not say."""
+    data = table(ply_columns(content()) | {"opacity": np.arange(5)}, coding="ascii")
+    doubles = read_splats(written(tmp_path / "a.ply", data.replace(b"property float", b"property double")))
+    plain = read_splats(written(tmp_path / "a.ply", data))
+    assert np.array_equal(doubles.scales, plain.scales) and np.array_equal(doubles.centres, plain.centres)
+    whole = written(tmp_path / "a.ply", data.replace(b"float opacity", b"uchar opacity"))
+    with pytest.raises(BadSplats, match="stores 'opacity' as uint8, expected float32"):
+        read_splats(whole)
+
+
 @pytest.mark.parametrize("comment", ["SplatRenderMode: mip", "antialiased 1"])
 def test_antialiasing_is_told(comment, tmp_path):
     assert "antialiasing" in read(tmp_path, ply_columns(content()), comment=comment).notes[0]
@@ -114,6 +142,14 @@ def test_harmonics_of_no_degree(tmp_path):
     columns = ply_columns(content())
     del columns["f_rest_44"]
     with pytest.raises(BadSplats, match="44 numbers of spherical harmonics"):
+        read(tmp_path, columns)
+
+
+def test_harmonics_with_one_missing(tmp_path):
+    """Not those of a lower degree: the numbers of red, green and blue would be mixed up."""
+    columns = ply_columns(content())
+    del columns["f_rest_9"]
+    with pytest.raises(BadSplats, match="'f_rest_10', but only 9 of those before it"):
         read(tmp_path, columns)
 
 

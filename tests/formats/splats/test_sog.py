@@ -42,6 +42,23 @@ def test_a_codebook_whose_first_entry_is_missing(tmp_path):
     assert np.array_equal(read(tmp_path, changed(files, scales=meta["scales"])).scales, expected.scales)
 
 
+def test_codebooks_of_few_splats(tmp_path):
+    """Early writers wrote as many entries as there were numbers. Bytes beyond them stand for nothing."""
+    files, book = sog_files(content(3, 0)), [-4.0, -3, -2, -1.5, -1, 0, 0.5, 0.75, 1]
+    files["s.webp"] = webp(np.arange(9, dtype=np.uint8).reshape(3, 3))
+    few = changed(files, scales={"codebook": book, "files": ["s.webp"]})
+    np.testing.assert_allclose(read(tmp_path, few).scales, np.exp(book).reshape(3, 3), rtol=1e-6)
+    splats = read(tmp_path, changed(files, scales={"codebook": book[:7], "files": ["s.webp"]}))
+    assert len(splats) == 2 and "1 splat has NaN" in splats.notes[0]
+
+
+def test_a_single_splat(tmp_path):
+    """Its ranges have no width."""
+    with np.errstate(invalid="ignore"):
+        splats, expected = read(tmp_path, sog_files(content(1, 0))), content(1, 0)
+    np.testing.assert_allclose(splats.centres, expected.centres, rtol=1e-5)
+
+
 def test_rotations_without_a_tag_are_none(tmp_path):
     files = sog_files(content())
     files["q.webp"] = webp(np.tile(np.uint8([200, 10, 30, 251]), (5, 1)))
@@ -55,8 +72,22 @@ def test_labels_beyond_the_palette_are_told(tmp_path):
     assert not splats.harmonics[:, 1:].any() and "5 splats have no entry" in splats.notes[0]
 
 
-def test_antialiasing_is_told(tmp_path):
-    assert "antialiasing" in read(tmp_path, changed(sog_files(content()), model="antialiased")).notes[0]
+@pytest.mark.parametrize(("model", "word"), [("antialiased", "antialiasing"), ("2dgs", "discs")])
+def test_how_it_was_trained_is_told(model, word, tmp_path):
+    assert word in read(tmp_path, changed(sog_files(content()), model=model)).notes[0]
+
+
+def test_splats_that_move_are_refused(tmp_path):
+    """SplatTransform's .sogst, whose still part is a SOG byte for byte."""
+    with pytest.raises(BadSplats, match="the format 'sogst', and only SOGs that stand still"):
+        read(tmp_path, changed(sog_files(content()), version=1, format="sogst"))
+
+
+def test_several_in_a_zip_are_not_one(tmp_path):
+    files = {f"{folder}/{name}": data for folder in "ab" for name, data in sog_files(content()).items()}
+    with pytest.raises(BadSplats, match="holds 2 SOGs"):
+        read(tmp_path, files)
+    assert len(read(tmp_path, files | sog_files(content(4)))) == 4  # at the root, where it has to be
 
 
 def test_newer_versions(tmp_path):

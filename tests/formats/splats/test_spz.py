@@ -11,6 +11,7 @@ from formats.splats.placing import placed
 from formats.splats.reading import is_splats, read_splats
 from formats.splats.spz import read_spz
 from tests.formats.splats import writers
+from tests.formats.splats.test_formats import SPZ, check
 from tests.formats.splats.test_gltf import covariances
 from tests.formats.splats.writers import content, spz, spz_container, spz_header, spz_streams, written
 
@@ -85,6 +86,47 @@ def test_axes_that_an_extension_states(axes, stated, tmp_path):
     np.testing.assert_allclose(read_back.harmonics, expected.harmonics, atol=1e-6)
     np.testing.assert_allclose(covariances(read_back), covariances(expected), atol=1e-6)
     assert read_back.up == (0, -1, 0) and read_back.notes == ()
+
+
+def levelled(leaves, version: int = 3, flags: int = 128, parents: int = 2) -> bytes:
+    """Spark's tree: inner splats, the root first, then leaves; opacities are halved, since inner ones go up
+    to 2. Behind the usual arrays are numbers of children, and the first child of each."""
+    inner = content(parents, 1, seed=9)
+    fields = ("centres", "scales", "rotations", "opacities", "harmonics")
+    both = writers.Content(
+        *(np.concatenate([getattr(each, name) for each in (inner, leaves)]) for name in fields)
+    )
+    both.opacities = both.opacities / 2
+    counts = np.array([1] * (parents - 1) + [len(leaves)] * (parents > 0) + [0] * len(leaves), "<u2")
+    starts = np.where(counts, np.arange(len(both)) + 1, 0).astype("<u4")
+    tree = counts.tobytes() + starts.tobytes()
+    return packed(spz_header(both, version, flags=flags), both, version, tree)
+
+
+@pytest.mark.parametrize(("version", "turn"), [(2, 0.05), (3, 1 / 511)])
+def test_the_finest_of_levels_of_detail(version, turn, tmp_path):
+    leaves = content(5, 1)
+    leaves.opacities[:2] = 0, 1
+    splats = read(tmp_path, levelled(leaves, version))
+    check(splats, leaves, SPZ | {"opacities": 1 / 255, "rotations": turn})
+    assert "5 of 7 splats, the finest" in splats.notes[0]
+    assert np.array_equal(read(tmp_path, levelled(leaves, version, parents=0)).centres, splats.centres)
+
+
+def test_levels_of_detail_that_are_cut_off_or_without_end(tmp_path):
+    leaves = content(5, 1)
+    with pytest.raises(BadSplats, match="ends within the children of 5 splats"):
+        read(tmp_path, packed(spz_header(leaves, 3, flags=128), leaves, 3))
+    endless = np.ones(5, "<u2").tobytes() + bytes(20)
+    with pytest.raises(BadSplats, match="have no finest"):
+        read(tmp_path, packed(spz_header(leaves, 3, flags=128), leaves, 3, endless))
+
+
+def test_flags_that_are_not_known_are_told(tmp_path):
+    for version in (3, 4):
+        data = bytearray(spz(content(), 4) if version == 4 else gzip.decompress(spz(content(), 3)))
+        data[14] |= 64
+        assert "flags that are not honoured: 0x40" in read(tmp_path, bytes(data)).notes[0]
 
 
 @pytest.mark.parametrize("version", [5, 2**32 - 1])
