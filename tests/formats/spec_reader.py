@@ -172,7 +172,7 @@ def answer(field: tuple, x: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.n
         return of_tensors(kind, told, arrays, x, d)
     if kind == "sparse":
         return of_bricks(told, arrays, x, d)
-    if kind in ("hash", "mlp"):
+    if kind in ("hash", "planes", "mlp"):
         return of_networks(kind, told, arrays, x, d)
     return of_grid(kind, told, arrays, x, d)
 
@@ -213,13 +213,18 @@ def of_grid(kind: str, told: dict, arrays: dict, x: np.ndarray, d: np.ndarray):
 
 
 def of_networks(kind: str, told: dict, arrays: dict, x: np.ndarray, d: np.ndarray):
-    """2.6: `hash` and `mlp`."""
+    """2.6: `hash`, `planes` and `mlp`."""
     box, cells, shape = np.array(told["aabb"]), told["cells"], told["shape"]
     y, rho = contract(x, d, cells.get("space", "bounded"))
     here = occupied(cells_of(arrays, "occupancy", cells["counts"]), np.array(cells["aabb"]), y)
     if kind == "hash":
         u = (y - box[:3]) / (box[3:] - box[:3]).max()
         features = hashed_levels(shape, told["resolution"], arrays, u)
+    elif kind == "planes":
+        u = (y - box[:3]) / (box[3:] - box[:3])
+        here, u = here & ((u >= 0) & (u <= 1)).all(1), np.clip(u, 0, 1)
+        features = levels_of_planes(shape, told["resolution"], arrays, u)
+    if kind != "mlp":
         weights = arrays["sigma_weights"]
         f = features @ weights[:-1] + weights[-1]
     else:
@@ -239,6 +244,19 @@ def of_networks(kind: str, told: dict, arrays: dict, x: np.ndarray, d: np.ndarra
     inner = np.maximum(inner @ arrays["rgb_hidden.weight"] + arrays["rgb_hidden.bias"], 0)
     rgb = (inner @ arrays["rgb_out.weight"] + arrays["rgb_out.bias"])[:, :3]
     return np.where(here, rho * density(f, told), 0), logistic(rgb)
+
+
+def levels_of_planes(shape: dict, resolution: list[int], arrays: dict, u: np.ndarray) -> np.ndarray:
+    """2.6: the features of `planes` of a `planes` field."""
+    levels = []
+    for level in range(shape["levels"]):
+        product = np.ones((len(u), shape["features"]))
+        for m, pair in enumerate(([0, 1], [0, 2], [1, 2])):
+            plane = arrays[f"density_plane_{level}_{m}"]
+            assert plane.shape[:2] == tuple(max(2, -(-resolution[a] // 2**level)) for a in pair)
+            product = product * lin(plane, u[:, pair])
+        levels.append(product)
+    return np.concatenate(levels, 1)
 
 
 def hashed_levels(shape: dict, resolution: list[int], arrays: dict, u: np.ndarray) -> np.ndarray:

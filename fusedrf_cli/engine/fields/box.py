@@ -131,12 +131,12 @@ class BoxField(ComputedField):
             return self.to("cpu").resampled(box, resolution).to(self.params.device)
         new = type(self)(self.shape, box, resolution, self.scale, self.shift, occupancy=self.occupancy)
         new.params, new.name = new.params.to(self.params.dtype), self.name
-        at = [unit_texels(new.box, self.box, axis, new.resolution[axis]) for axis in range(3)]
         for part, old, target in zip(
             self.parts, self.sections().values(), new.sections().values(), strict=True
         ):
             for dimension, axis in enumerate(part.axes):
-                old = interpolate_axis(old, dimension, at[axis])
+                at = unit_texels(new.box, self.box, axis, target.shape[dimension])
+                old = interpolate_axis(old, dimension, at)
             target.copy_(old)
         return new
 
@@ -203,12 +203,17 @@ class BoxField(ComputedField):
 
     @cached_property
     def reached(self) -> list[np.ndarray | None]:
-        """For each part, where the cache lines begin that hold numbers of used vertices; None: all."""
+        """For each part, where the cache lines begin whose numbers learn; None: all."""
         vertices = np.flatnonzero(self.used) if any(part.on_vertices for part in self.parts) else None
-        return [
-            start + lines_of(vertices, int(np.prod(part.shape[3:]))) if part.on_vertices else None
-            for part, start in zip(self.parts, self.starts, strict=False)
+        lines = [
+            lines_of(vertices, math.prod(part.shape[3:])) if part.on_vertices else self.lines_learnt(part)
+            for part in self.parts
         ]
+        return [own if own is None else start + own for own, start in zip(lines, self.starts, strict=False)]
+
+    def lines_learnt(self, part: ParameterBlock) -> np.ndarray | None:
+        """The same of a part that is not on vertices, counted from where it begins."""
+        return None
 
     def groups(self) -> list[Group]:
         """See ComputedField: of a part each, or of neighbours that are learnt alike."""

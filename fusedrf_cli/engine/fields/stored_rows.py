@@ -49,6 +49,15 @@ class StoredRows:
         """Those of the first so many rows, a multiple of RUN."""
         return StoredRows(self.runs & (np.arange(len(self.runs)) < count // RUN), self.all)
 
+    def spread(self, count: int) -> "StoredRows":
+        """So many rows of these, rounded down to runs, in as many blocks as they can be: no others take more
+        to tell."""
+        blocks = self.runs.reshape(-1, TOGETHER // RUN)
+        nth = (blocks.cumsum(1) - 1).ravel()[self.runs]
+        chosen, runs = np.argsort(nth, kind="stable")[: max(count // RUN, 1)], np.zeros_like(self.runs)
+        runs[np.flatnonzero(self.runs)[chosen]] = True
+        return StoredRows(runs, self.all)
+
     def saves(self, width: int) -> bool:
         """Whether a file is to have these alone of all rows, of so many numbers."""
         most = current(StoredRowsConfig).most_held * width * self.all
@@ -82,9 +91,9 @@ class StoredRows:
 
     def told(self, width: int) -> int:
         """Bits that tell of them, at most, of rows of so many numbers: of a block that it holds any, which,
-        how many, and scales."""
-        per_block = TOGETHER // RUN + 8 + 16 * width
-        return len(self.blocks) + per_block * len(self.masks)
+        how many, and scales, where these are more than those of as many whole blocks."""
+        few, scales = len(self.masks), len(self.masks) - self.count // TOGETHER
+        return len(self.blocks) + (TOGETHER // RUN + 8) * few + 16 * width * scales
 
     def state(self) -> dict[str, np.ndarray]:
         """Bits: which blocks hold any rows, and which of their runs."""

@@ -37,3 +37,16 @@ def test_rows_beyond_the_last_are_refused():
     state = StoredRows.other_than_0(numbers).state()
     with pytest.raises(ValueError, match="beyond the 68"):
         StoredRows.from_state(state["blocks"], state["held"], 68)
+
+
+def test_no_rows_take_more_to_tell_than_those_that_are_spread():
+    """Of all choices of as many runs of some, drawn at random and the densest."""
+    rng = np.random.default_rng(0)
+    some = StoredRows(rng.random(16 * 40) < 0.6, 64 * 40)
+    for count in (4, 100, 160, 400, some.count):
+        spread = some.spread(count)
+        assert spread.count == count and not (spread.runs & ~some.runs).any()
+        for order in (np.arange(some.count // 4), *(rng.permutation(some.count // 4) for _ in range(20))):
+            runs = np.zeros_like(some.runs)
+            runs[np.flatnonzero(some.runs)[order[: count // 4]]] = True
+            assert StoredRows(runs, some.all).told(4) <= spread.told(4)

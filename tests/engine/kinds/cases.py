@@ -18,7 +18,7 @@ from tests.analytic.export import with_network
 from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, random_vm
 from .sparse_cases import random_sparse
 
-SLOW_TO_COMPILE = {"cp", "dense-mlp", "hash", "mlp", "vm-mlp"}
+SLOW_TO_COMPILE = {"cp", "dense-mlp", "hash", "mlp", "planes", "vm-mlp"}
 """Kinds whose loops the quick tests do not wait for, where they try every kind."""
 
 

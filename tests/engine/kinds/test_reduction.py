@@ -19,6 +19,7 @@ MAKERS = {
     "dense": partial(random_boxed, "dense", torch.float32),
     "dense-mlp": partial(random_boxed, "dense-mlp", torch.float32),
     "vm-mlp": partial(random_vm_mlp, torch.float32, cells=4),
+    "planes": partial(random_boxed, "planes", torch.float32),
 }
 
 

@@ -5,12 +5,13 @@ import math
 import torch
 
 from fusedrf_cli.engine.encodings.hash_grid import FINER
-from fusedrf_cli.engine.fields.stored_rows import StoredRows
+from fusedrf_cli.engine.fields.computed import packed_bits
+from fusedrf_cli.engine.fields.stored_rows import RUN, StoredRows
 from fusedrf_cli.engine.kinds.box_kind import BoxKind
 from fusedrf_cli.engine.kinds.builder import Contents, Plan, Section, StorageSetting
 from fusedrf_cli.engine.kinds.hash.field import BASE, ROWS, HashField, HashShape
-from fusedrf_cli.engine.kinds.hash.trimming import rows_used, without_unasked, without_unused
-from fusedrf_cli.engine.kinds.reduction import Reduction, coarser
+from fusedrf_cli.engine.kinds.hash.trimming import rows_used, with_fewer_rows, without_unasked
+from fusedrf_cli.engine.kinds.reduction import Reduction
 
 MOST_ROWS = 19  # log2, of a level: a step looks through the gradients of all
 
@@ -44,15 +45,13 @@ class HashKind(BoxKind):
         return outline
 
     def reduction(self, outline: HashField, voxel: float, storage: StorageSetting) -> Reduction:
-        """See Kind: without the levels that wider texels leave out."""
-        box, resolution = outline.box, coarser(outline.box, outline.resolution, voxel)
-        same, unit = resolution == outline.resolution, (outline.scale, outline.shift)
-        small = HashField(outline.shape, box, resolution, *unit, outline.params, outline.occupancy)
-
-        def make(field: HashField) -> HashField:
-            return field if same else without_unused(field.resampled(box, resolution))
-
-        return Reduction(contents_of(small, outline.told), make, same)
+        """See Kind: with fewer rows, those of the largest numbers: half as many for texels four times as
+        wide."""
+        held, own = outline.told.first(rows_used(outline)), outline.voxel_size
+        if voxel <= own or outline.shape.features % RUN:
+            return Reduction(contents_of(outline, held), lambda field: field, True)
+        few = held.spread(int(held.count * math.sqrt(own / voxel)))
+        return Reduction(contents_of(outline, few), lambda field: with_fewer_rows(field, few.count), False)
 
     def trimmed(self, field: HashField) -> HashField:
         """See hash/trimming.py."""
@@ -65,11 +64,12 @@ class HashKind(BoxKind):
         return super().describe(field) | {"levels": len(levels), "rows": rows}
 
 
-def contents_of(field: HashField, other_than_0: StoredRows) -> Contents:
-    """What a field without unused rows is stored with, of which only those say something."""
-    held, bits = other_than_0.first(rows_used(field)), field.occupancy.occupied.size
+def contents_of(field: HashField, held: StoredRows) -> Contents:
+    """What a field of those rows alone is stored with."""
+    cells, bits = field.occupancy.occupied, field.occupancy.occupied.size
     sections = [Section(part.name, field.stored_shape(part)) for part in field.parts]
     if held.saves(field.shape.features):
+        bits = 8 * sum(array.nbytes for array in packed_bits("", cells, 0).values())
         bits += held.told(field.shape.features)
         few = held.count, field.shape.features
         sections = [Section(s.name, few) if s.name == ROWS else s for s in sections]

@@ -9,6 +9,8 @@ import numpy as np
 from fusedrf_cli.engine.decoders import density_linear, sh_mlp
 from fusedrf_cli.engine.encodings import hash_grid, trunk_features
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot, check_counts
+from fusedrf_cli.engine.fields.box import ParameterBlock
+from fusedrf_cli.engine.kernels.primitives import LINE
 from fusedrf_cli.engine.settings import current
 
 ROWS = "density_rows"
@@ -57,6 +59,8 @@ class HashField(AssembledField):
     shape_type = HashShape
     hashed_part = ROWS
     over_texels = False
+    few_rows = False
+    """Whether rows of 0 stay so when it learns."""
 
     @classmethod
     def slots_of(cls, shape: HashShape) -> dict[str, Slot]:
@@ -70,6 +74,13 @@ class HashField(AssembledField):
             "sigma": Slot(density_linear, {"width": width}, "sigma_", config.density_rate),
             "rgb": Slot(sh_mlp, {"width": width, "hidden": shape.hidden}, "rgb_", config.network_rate),
         }
+
+    def lines_learnt(self, part: ParameterBlock) -> np.ndarray | None:
+        """See BoxField."""
+        if not self.few_rows or part.name != ROWS:
+            return None
+        lines = self.sections()[ROWS].detach().cpu().view(-1, LINE)
+        return LINE * np.flatnonzero(lines.any(1).numpy())
 
     @property
     def used_levels(self) -> list[dict]:

@@ -1,0 +1,15 @@
+"""The `planes` kind: K-Planes."""
+
+from fusedrf_cli.engine.kinds.box_kind import BoxKind
+from fusedrf_cli.engine.kinds.planes.field import PlanesField
+
+
+class PlanesKind(BoxKind):
+    """See Kind."""
+
+    name = "planes"
+    good_for = "Products of planes, as K-Planes holds what stands still."
+    field = PlanesField
+
+
+KIND = PlanesKind()
