@@ -75,6 +75,12 @@ class FieldSet:
             raise MissingMember(f"{self.path}: holds no member {member!r}")
         return self.views[member]
 
+    def sizes(self, member: str) -> dict[str, int]:
+        """Bytes of a field's member and of those that it shares with others, by their names. Raises as
+        `shared_members`."""
+        shared = shared_members(member, self.headers[member], self.headers, str(self.path))
+        return {name: self.headers[name].size for name in (member, *shared.values())}
+
     def placed(self, member: str) -> tuple[Instance, ...]:
         """What a member stands for, which may have held several objects; nothing of one that is not here."""
         alone = (Instance("", False, member, np.eye(4), WHITE),) if member in self.headers else ()
@@ -155,9 +161,7 @@ class BundleWriter:
         """Take over a member of another bundle, and the parts it shares, byte for byte. Raises MissingMember,
         and of a path as `read_bundle`."""
         bundle = bundle if isinstance(bundle, FieldSet) else OpenBundle(bundle)
-        header, members = bundle.headers.get(member), bundle.headers
-        shared = {} if header is None else shared_members(member, header, members, str(bundle.path))
-        for name in (member, *shared.values()):
+        for name in bundle.sizes(member) if member in bundle.headers else (member,):
             self.members[name] = bundle.data(name)
         return member
 
@@ -310,7 +314,7 @@ def _scene_summary(scene: SceneGraph, headers: dict[str, FieldHeader]) -> dict:
     nodes = []
     for node, depth, object_to_world in scene.walk():
         header = headers.get(node.field)
-        aabb = header.metadata.get("aabb") if header else None
+        aabb = header.box if header else None
         nodes.append(
             {
                 "name": node.name,

@@ -88,6 +88,13 @@ class FieldHeader:
         return [name for name in self.specs if name not in parts]
 
     @property
+    def box(self) -> list[float] | None:
+        """(6,) in the field's frame: its own, or that of its cells; None: neither is told."""
+        cells = self.metadata.get("cells")
+        around = cells.get("aabb") if isinstance(cells, dict) else None
+        return self.metadata.get("aabb") or (around if _is_box(around) else None)
+
+    @property
     def precision(self) -> str:
         """The one of PRECISIONS that it was written with, as its arrays show; of several the most exact."""
         if any(self.specs[name].dtype == DTYPES["F32"] for name in self.plain):
@@ -183,9 +190,13 @@ def _content(entry: object, where: str) -> tuple[str, dict, dict]:
     return kind, metadata, coded
 
 
-def _check_aabb(aabb: object, where: str) -> None:
+def _is_box(aabb: object) -> bool:
     numbers = isinstance(aabb, list) and len(aabb) == 6 and all(type(x) in (int, float) for x in aabb)
-    if not numbers or not all(low < high for low, high in zip(aabb[:3], aabb[3:], strict=True)):
+    return numbers and all(low < high for low, high in zip(aabb[:3], aabb[3:], strict=True))
+
+
+def _check_aabb(aabb: object, where: str) -> None:
+    if not _is_box(aabb):
         raise BadSchema(f"{where}: aabb {aabb!r} is not six numbers, each minimum below its maximum")
 
 

@@ -28,7 +28,7 @@ def objects_in(scene: SceneGraph, headers: dict[str, FieldHeader]) -> list[dict]
         if inside and belongs(leaf.name, UNNAMED):  # it is what they were distilled to, or what fills a cut
             continue
         header, matrix = headers[leaf.field], leaf.object_to_world
-        aabb = header.metadata.get("aabb")
+        aabb = header.box
         box = world_aabb(aabb, matrix) if aabb else None
         rows.append(_row(leaf.name, header.kind, matrix, box, header.size, users[leaf.field]))
     holders = [leaf for leaf in leaves if belongs(leaf.name, UNNAMED)] or leaves

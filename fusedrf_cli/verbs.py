@@ -91,6 +91,8 @@ def locked_outputs(request: Writing, progress: NullProgress) -> Iterator[None]:
     from formats.atomic import check_writable
     from formats.locks import output_lock
 
+    if not request.folders:
+        _check_no_other_ending(request)
     others = request.beside()
     outputs = {request.output: request.folders} | others
     if len({os.path.realpath(path) for path in outputs}) <= len(others):
@@ -121,6 +123,22 @@ def _check_ending(path: str, endings: Sequence[str]) -> None:
         files = f"give a name that ends in {', '.join(endings)}, or" if endings else "give"
         raise UsageProblem(
             f"{path}: no {ending} is written; {files} a folder, whose name has no ending, or ends in a slash"
+        )
+
+
+OF_OTHERS = frozenset(
+    ".png .jpg .jpeg .webp .gif .mp4 .ply .obj .glb .gltf .stl .off .splat .spz .sog .ksplat "
+    ".ckpt .pth .pt .th .tar .npz .ingp .msgpack".split()
+)
+"""Endings that bundles and scenes never have."""
+
+
+def _check_no_other_ending(request: Writing) -> None:
+    """UsageProblem where a bundle or a scene would have the name of something else."""
+    ending, usual = ending_of(request.output), ".json" if request.stdout else ".rfpack"
+    if ending in OF_OTHERS:
+        raise UsageProblem(
+            f"{request.output}: what is written is no {ending} file; give another name, such as NAME{usual}"
         )
 
 

@@ -67,6 +67,7 @@ class System(NamedTuple):
     rule: str
     """Of the names in its files, as `_fits` reads it."""
     beside: tuple[str, ...] = ()
+    is_read: bool = True
 
 
 def open_checkpoint(path: Path | str) -> Checkpoint:
@@ -84,9 +85,8 @@ def open_checkpoint(path: Path | str) -> Checkpoint:
     names = list(islice(_names(entries), MAX_NAMES))
     system = next((name for name, system in SYSTEMS.items() if _fits(system.rule, names)), None)
     if system is None:
-        raise UnknownCheckpoint(
-            f"{path}: {_described(entries)}, which no known system writes; {known_systems()}"
-        )
+        told = _likeness(names) or known_systems()
+        raise UnknownCheckpoint(f"{path}: {_described(entries)}, which no known system writes; {told}")
     if system == "instant-ngp":
         _check_snapshot(entries["snapshot"], path)
     found = Checkpoint(system, entries, path)
@@ -100,7 +100,26 @@ def open_checkpoint(path: Path | str) -> Checkpoint:
 
 def known_systems() -> str:
     """ "known are TensoRF, …"."""
-    return f"known are {', '.join(system.title for system in SYSTEMS.values())}"
+    titles = ", ".join(system.title for system in SYSTEMS.values() if system.is_read)
+    return (
+        f"known are {titles}, and splats in .ply, .spz, .sog, .splat, .ksplat and glTF; give a file of those"
+    )
+
+
+def _likeness(names: list[str]) -> str:
+    """Of names that lie elsewhere in a system's own files, what they should be; "" of any others."""
+    last = [name.rpartition("/")[2].removeprefix("module.") for name in names]
+    for system in SYSTEMS.values():
+        for words in system.rule.split("|"):
+            wanted = [word for word in words.split() if not word.startswith("!")]
+            inner = [word.rpartition("/")[2] for word in wanted if "/" in word]
+            if inner and all(fnmatch.filter(last, word) for word in inner):
+                lacking = [word.partition(":")[0] for word in wanted if not fnmatch.filter(names, word)]
+                return (
+                    f"its arrays are named as {system.title} names them, but {listed(lacking, 3)} lack: give "
+                    "the file as that saves it"
+                )
+    return ""
 
 
 # --- files --------------------------------------------------------------------------------------------------
@@ -236,6 +255,7 @@ SYSTEMS = {  # the first whose rule fits counts
         "DVGO (NDC)",
         f"model_state_dict/act_shift.grid:* {_GRIDS} | model_state_dict/act_shift:1x1x1x1x* {_GRIDS}",
         ("config.py",),
+        is_read=False,
     ),
     "dvgo": System(  # of its first version without classes of grids
         "DVGO",

@@ -169,7 +169,9 @@ def _place(file: BinaryIO, storage: _OldStorage, key: str, size: int) -> None:
     count = int.from_bytes(file.read(8), "little", signed=True)
     storage.start = file.tell()
     stop = storage.start + storage.count * np.dtype(_stored(storage.dtype)).itemsize
-    if count != storage.count or stop > size:
+    if stop > size:
+        raise BadCheckpoint(f"is cut off: it should go on to byte {stop:,}, found {size:,} bytes; {AGAIN}")
+    if count != storage.count:
         raise BadCheckpoint(
             f"storage {key} is said to hold {storage.count:,} numbers, found {count:,}; {AGAIN}"
         )

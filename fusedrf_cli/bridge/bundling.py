@@ -202,15 +202,19 @@ def uncropped(graph: SceneGraph) -> SceneGraph:
 
 
 def stored_bytes(loaded: LoadedScene) -> Mapping[int, int]:
-    """Bytes of the members of fields that their bundles have, by the field's id."""
+    """Bytes of the members of fields that their bundles have, with what they share, by the field's id."""
     known = (f for f in loaded.fields if f.member in f.bundle.headers and not f.cut)
-    return {id(f.placed.field): f.bundle.headers[f.member].size for f in known}
+    return {id(f.placed.field): sum(f.bundle.sizes(f.member).values()) for f in known}
 
 
 def unchanged_bytes(loaded: LoadedScene) -> int | None:
     """Bytes of the members of all fields; None: they are not known."""
-    sizes = {f.member: f.bundle.headers[f.member].size for f in loaded.fields if f.member in f.bundle.headers}
-    return sum(sizes.values()) if all(f.member in sizes for f in loaded.fields) else None
+    if not all(f.member in f.bundle.headers for f in loaded.fields):
+        return None
+    sizes: dict[str, int] = {}
+    for f in loaded.fields:
+        sizes |= f.bundle.sizes(f.member)
+    return sum(sizes.values())
 
 
 def history_nodes(scene: LoadedScene, output: str, kept_members: Container[str]) -> list[dict]:

@@ -4,11 +4,12 @@ import numpy as np
 
 from formats.camera_set import CameraSet, capture_camera_set, read_camera_set
 from formats.errors import FormatError, LimitExceeded
+from formats.graph import belongs
 from formats.views import Capture
 from fusedrf_cli.bridge.scene import LoadedScene, PlacedCameraSet
 from fusedrf_cli.bridge.sizes import camera_bytes
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.occupancy import placed_box
+from fusedrf_cli.engine.fields.occupancy import enclosing, placed_box
 
 
 def cameras_of_capture(capture: Capture, cut_out: bool, progress) -> dict | None:
@@ -77,4 +78,21 @@ def view_box_in_frame(scene: LoadedScene, field, origin: np.ndarray) -> np.ndarr
     frame lies at `origin` (see `render_image`)."""
     if scene.graph.framing is not None:
         return np.asarray(scene.graph.framing)
-    return placed_box(field.occupancy.look_at_box, origin)
+    return framed(scene, placed_box(field.occupancy.look_at_box, origin))
+
+
+def framed(scene: LoadedScene, around: np.ndarray) -> np.ndarray:
+    """(6,) the box that pictures of a scene show, in a box `around` all of it: where most of that is empty,
+    as around splats of which some lie far from all others, what its sources' own pictures show, and all
+    other fields."""
+    if not scene.framings or any(p.unbounded for p in scene.placed):
+        return around
+    boxes = [placed_box(np.asarray(f.box), f.object_to_world) for f in scene.framings]
+    framed_by_themselves = {f.name for f in scene.framings}
+    for p in scene.placed:
+        if not belongs(p.name, framed_by_themselves):
+            boxes.append(placed_box(p.occupancy.look_at_box, p.object_to_world))
+    box = enclosing(boxes)
+    box = np.concatenate([np.maximum(box[:3], around[:3]), np.minimum(box[3:], around[3:])])
+    sides = box[3:] - box[:3]
+    return box if sides.min() > 0 and 2 * sides.max() < (around[3:] - around[:3]).max() else around

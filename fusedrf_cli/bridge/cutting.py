@@ -10,13 +10,14 @@ from formats.records import BYTES_PER_NUMBER
 from formats.scene import Leaf, SceneGraph
 from fusedrf_cli.bridge.editing import Draft
 from fusedrf_cli.bridge.memory import ownership, sources
-from fusedrf_cli.bridge.scene import LoadedScene, grouped
+from fusedrf_cli.bridge.scene import LoadedScene, SourceField, grouped
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField, shown_at
 from fusedrf_cli.engine.composition.composite import as_composite
+from fusedrf_cli.engine.composition.crops import NO_CROPS
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.occupancy import seen_placement, transformed_aabb
-from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.fields.streamed import StreamedField, opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.selection.cells import CellConfig, Selection
@@ -205,3 +206,34 @@ def cut_with_hidden(
         gone = gone.joined(revealed)
         rest = cut(whole, gone, True, touched)[1]
     return objects, rest
+
+
+def cut_to_crops(loaded: LoadedScene) -> LoadedScene:
+    """The same scene in which each field that is cropped has been cut by its kind, to cells: what is stored
+    anew needs no numbers that nothing shows. InvalidInput where a kind cannot be cut, or nothing is left."""
+    cut: dict[tuple[int, str], StreamedField] = {}
+
+    def after(source: SourceField) -> SourceField:
+        placed, where = source.placed, f"{source.bundle.path}: node '{source.placed.name}'"
+        needs = replace(source.needs, unwritten=0)  # a copy of some of it
+
+        def read() -> StoredField:
+            whole = opened(placed.field)
+            try:
+                part = registry.kind(whole.kind).cropped(whole.to("cpu"), placed.crops.hold)
+            except ValueError as error:
+                raise InvalidInput(f"{where}: {error}") from error
+            if part is None:
+                raise InvalidInput(f"{where}: its crop holds no whole cell of it; give a larger one")
+            return part.to(whole.params.device)
+
+        if not placed.crops:
+            return source
+        key = id(placed.field), repr([(c.is_ball, c.to_unit.tolist()) for c in placed.crops.items])
+        if key not in cut:
+            name = f"{source.member} {key[1]}"
+            cut[key] = StreamedField(lambda: loaded.field_cache.take(name, needs.held, read))
+        whole = replace(placed, field=cut[key], crops=NO_CROPS)
+        return replace(source, placed=whole, needs=needs, cut=True, crops=())
+
+    return replace(loaded, fields=tuple(map(after, loaded.fields)))

@@ -1,6 +1,7 @@
 """A bundle that is being edited: its scene graph, and the fields that come to those it has, which keep their
 bytes."""
 
+import os
 import time
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import replace
@@ -23,7 +24,7 @@ from formats.graph import (
 from formats.history import check_history, distilled, summed_up
 from formats.records import FieldRecord
 from formats.scene import Node, SceneGraph
-from formats.undo import keep
+from formats.undo import before, chain, history_folder, keep
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.runtime import written_somewhere
@@ -161,6 +162,12 @@ class Edit:
         self.draft = Draft(request.fused, self.memory, device)
         copied = {"fields of a bundle of an earlier version": self.draft.bundle.copied}
         self.memory.expect(copied, advice="allow more by --memory")
+        in_place = os.path.realpath(request.fused) == os.path.realpath(request.output)
+        undoable = before(self.draft.bundle.scene) is not None
+        if undoable and in_place and not request.undoable:
+            kept = len(chain(history_folder(request.fused), request.fused))
+            earlier = f"neither this edit nor the {kept} before it can be undone"
+            progress.warn(f"{request.fused}: without --undoable {earlier}")
 
     def done(
         self,

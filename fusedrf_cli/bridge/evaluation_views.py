@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from formats.camera_set import CameraSet, read_camera_set
 from formats.views import View
-from fusedrf_cli.bridge.capture_cameras import camera_set_of
+from fusedrf_cli.bridge.capture_cameras import camera_set_of, framed
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.scene import LoadedScene
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -103,7 +103,7 @@ def evaluation_views_of(
     scene: LoadedScene, composed: ComposedField, count: int, size: tuple[int, int], seed: int | tuple
 ) -> list[EvaluationView]:
     """At least `count` seeded views (see `evaluation_views`) of a scene, which `composed` is as one field."""
-    box = placed_box(composed.occupancy.look_at_box, composed.origin)
+    box = framed(scene, placed_box(composed.occupancy.look_at_box, composed.origin))
     seen = share_seen(scene, composed) if composed.occupancy.space is unbounded else all_of_it
     return evaluation_views(camera_set_of(scene), box, view_targets(scene), count, size, seed, seen)
 

@@ -10,6 +10,7 @@ from fusedrf_cli.bridge.background import Background, background_for
 from fusedrf_cli.bridge.building import BestTrial, BuildingConfig, FuseScene, Maker
 from fusedrf_cli.bridge.bundling import FusedBundle, stored_bytes, unchanged_bytes
 from fusedrf_cli.bridge.capture_cameras import result_cameras, result_view_box
+from fusedrf_cli.bridge.cutting import cut_to_crops
 from fusedrf_cli.bridge.fuse_report import check_target, chosen_of, figures_of, reached_by
 from fusedrf_cli.bridge.memory import Memory, MemoryConfig, asking_in_waves, stages, will_learn
 from fusedrf_cli.bridge.memory import sources as in_memory
@@ -26,7 +27,6 @@ from fusedrf_cli.bridge.runtime import (
 )
 from fusedrf_cli.bridge.scene import (
     LoadedScene,
-    cut_to_crops,
     note_options,
     refuse_options,
     unusable_kind,
@@ -75,13 +75,24 @@ def fuse(
 ) -> dict:
     """Turn a composed scene into a bundle of it, of one field or of a field for each source, with the scene's
     history; `somewhere` writes, as `written_somewhere` does. Where `auto` would keep the sources as nodes and
-    these do not fit, one field is learnt."""
+    these do not fit, one field is learnt; a run that goes on learns the kind that it had chosen."""
+    if (chosen := chosen_before(request)) is not None:
+        report = fuse_as(replace(request, kind=chosen), progress, load, somewhere)
+        return report | {"kind_because": "the run that went on had chosen it"}
     try:
         return fuse_as(request, progress, load, somewhere)
     except NodesTooLarge as error:
         progress.warn(f"{error}, more than --max-size: one field of the kind {error.kind} is learnt instead")
         report = fuse_as(replace(request, kind=error.kind), progress, load, somewhere)
         return report | {"kind_because": str(error)}
+
+
+def chosen_before(request: FuseRequest) -> str | None:
+    """The kind of field that a run to go on had chosen; None where there is none to go on, or it said so."""
+    if not request.resume or request.kind != registry.AUTO:
+        return None
+    name = load_checkpoint(request.output, "fuse")[1].get("kind")
+    return name if name in registry.names() and registry.kind(name).field is not None else None
 
 
 def fuse_as(request: FuseRequest, progress, load: Load, somewhere: Callable) -> dict:

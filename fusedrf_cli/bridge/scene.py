@@ -21,7 +21,7 @@ from fusedrf_cli.bridge.field_cache import FieldCache
 from fusedrf_cli.bridge.memory import Memory, sources
 from fusedrf_cli.engine.composition.affine import WHITE, Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.composition.crops import NO_CROPS, Crop, Crops
+from fusedrf_cli.engine.composition.crops import Crop, Crops
 from fusedrf_cli.engine.fields.base import FieldMemory, StoredField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placement
 from fusedrf_cli.engine.fields.streamed import StreamedField, opened
@@ -74,6 +74,18 @@ class PlacedCameraSet:
 
 
 @dataclass(frozen=True)
+class PlacedFraming:
+    """What pictures of a source of a scene show by themselves."""
+
+    name: str
+    """Of the node that names the source."""
+    box: tuple[float, ...]
+    """(6,) in the source's own world."""
+    object_to_world: np.ndarray
+    """(4, 4) from that world to the scene's."""
+
+
+@dataclass(frozen=True)
 class LoadedScene:
     """A scene graph with its fields read."""
 
@@ -84,6 +96,8 @@ class LoadedScene:
     field_cache: FieldCache
     camera_sets: tuple[PlacedCameraSet, ...] = ()
     """Of its sources."""
+    framings: tuple[PlacedFraming, ...] = ()
+    """Of those of its sources that say so, and are not cropped."""
     bundle: OpenBundle | None = None
     """That the graph was read from; None: a scene.json."""
 
@@ -272,6 +286,7 @@ class _Loader:
         self.bundles: dict[Path, OpenBundle] = {}
         self.fields: dict[str, StreamedField] = {} if known is None else known
         self.camera_sets: list[PlacedCameraSet] = []
+        self.framings: list[PlacedFraming] = []
 
     def load(self, graph: SceneGraph, allow_outside: bool, bundle: OpenBundle | None = None) -> LoadedScene:
         return self.read(graph, self.found(graph, allow_outside, bundle), bundle)
@@ -309,9 +324,8 @@ class _Loader:
                 sources([*sizes.values()], self.field_cache.room) | reading, advice="use smaller sources"
             )
         fields = tuple(self.source(leaf, b, member, needs[b, member]) for leaf, b, member in field_list)
-        return LoadedScene(
-            fields, graph.composition, graph, self.path, self.field_cache, tuple(self.camera_sets), bundle
-        )
+        kept = tuple(self.camera_sets), tuple(self.framings)
+        return LoadedScene(fields, graph.composition, graph, self.path, self.field_cache, *kept, bundle)
 
     def sources(self, leaf, path: Path) -> list[FoundField]:
         """The arguments of `source` for the fields of the bundle that a leaf names."""
@@ -333,6 +347,8 @@ class _Loader:
             self.camera_sets.append(
                 PlacedCameraSet(leaf.name, leaf.background, scene.cameras, leaf.object_to_world)
             )
+        if scene.framing is not None and not leaf.crops:
+            self.framings.append(PlacedFraming(leaf.name, scene.framing, leaf.object_to_world))
         named = [leaf.name] if len(inner) == 1 else [f"{leaf.name}/{node.name}" for node in inner]
         if len(inner) > 1:
             leaf = replace(leaf, groups=(*leaf.groups, (leaf.name, scene.composition)))
@@ -398,37 +414,6 @@ def nothing_held(where: str, box: np.ndarray, crop: ShownPart) -> InvalidInput:
         f"{where}: its crop holds nothing of it; in the frame of the node that is cropped it lies within "
         f"{lies}; give a box or a sphere that reaches into that"
     )
-
-
-def cut_to_crops(loaded: LoadedScene) -> LoadedScene:
-    """The same scene in which each field that is cropped has been cut by its kind, to cells: what is stored
-    anew needs no numbers that nothing shows. InvalidInput where a kind cannot be cut, or nothing is left."""
-    cut: dict[tuple[int, str], StreamedField] = {}
-
-    def after(source: SourceField) -> SourceField:
-        placed, where = source.placed, f"{source.bundle.path}: node '{source.placed.name}'"
-        needs = replace(source.needs, unwritten=0)  # a copy of some of it
-
-        def read() -> StoredField:
-            whole = opened(placed.field)
-            try:
-                part = registry.kind(whole.kind).cropped(whole.to("cpu"), placed.crops.hold)
-            except ValueError as error:
-                raise InvalidInput(f"{where}: {error}") from error
-            if part is None:
-                raise InvalidInput(f"{where}: its crop holds no whole cell of it; give a larger one")
-            return part.to(whole.params.device)
-
-        if not placed.crops:
-            return source
-        key = id(placed.field), repr([(c.is_ball, c.to_unit.tolist()) for c in placed.crops.items])
-        if key not in cut:
-            name = f"{source.member} {key[1]}"
-            cut[key] = StreamedField(lambda: loaded.field_cache.take(name, needs.held, read))
-        whole = replace(placed, field=cut[key], crops=NO_CROPS)
-        return replace(source, placed=whole, needs=needs, cut=True, crops=())
-
-    return replace(loaded, fields=tuple(map(after, loaded.fields)))
 
 
 def background_of(scene: LoadedScene) -> SourceField:

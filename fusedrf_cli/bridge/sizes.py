@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from formats.bundle import BundleWriter
 from formats.quantisation import BLOCKS, code_bytes, is_coded
-from formats.records import BITS, BYTES_PER_NUMBER, FieldRecord, coded_bytes, encode_field
+from formats.records import BITS, BYTES_PER_NUMBER, FieldRecord, coded_bytes
 from formats.scene import SceneGraph, dump_scene
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.kinds.builder import Contents, Section
@@ -40,8 +41,10 @@ class BundleSizes:
         return total + sum(section_bytes(section, precision) for section in contents.sections)
 
     def exactly(self, field: StoredField, precision: str) -> int:
-        """The bytes of a field, encoded."""
-        return len(encode_field(FieldRecord(field.kind, *field.state()), precision))
+        """The bytes of a field, encoded, with what it shares with others."""
+        writer = BundleWriter()
+        writer.add_field(FieldRecord(field.kind, *field.state()), precision)
+        return sum(map(len, writer.members.values()))
 
     def per_number(self, precision: str) -> float:
         """About so many bytes for a number."""

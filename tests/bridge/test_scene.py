@@ -8,7 +8,8 @@ import torch
 
 from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge.scene import background_of, cut_to_crops, grouped, load_scene
+from fusedrf_cli.bridge.cutting import cut_to_crops
+from fusedrf_cli.bridge.scene import background_of, grouped, load_scene
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid

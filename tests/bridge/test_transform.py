@@ -128,6 +128,10 @@ def test_edits_are_undone_as_they_were_made(report, run, folder):
     assert [entry["event"] for entry in told["history"]][1:] == ["moved", "deleted", "added", "replaced"]
     assert [entry["objects"] for entry in told["history"]][1:] == [["red"], ["blue"], ["azure"], ["red"]]
     assert told["undoable"] == 4 and told["history"][3]["objects"] == ["azure"]
+    said = report("rename", "fused.rfpack", "red", "rot", "-o", "other.rfpack", "--undoable")
+    assert said["warnings"] == []
+    said = report("rename", "other.rfpack", "rot", "rouge", "-o", "other.rfpack", "-w")
+    assert "neither this edit nor the 5 before it can be undone" in said["warnings"][0]
     for before in reversed(was[:-1]):
         report("undo", "fused.rfpack", "-o", "fused.rfpack", "-w")
         assert (folder / "fused.rfpack").read_bytes() == before

@@ -133,7 +133,8 @@ def imported_from(
         imported = read(checkpoint, **given)
     except (FormatError, ValueError) as error:
         where = "" if str(error).startswith(f"{checkpoint.path}: ") else f"{checkpoint.path}: "
-        raise InvalidInput(f"{where}{error}") from error
+        cure = f"copy it again, or save it with {SYSTEMS[checkpoint.system].title} as it is published"
+        raise InvalidInput(f"{where}{error}" + ("" if "; " in str(error) else f"; {cure}")) from error
     notes = [] if "time" in given else unmoved(request)
     return replace(imported, notes=[*imported.notes, *notes])
 
@@ -141,7 +142,10 @@ def imported_from(
 def check_boxless(request: ImportRequest) -> None:
     """UsageProblem where a box is given of a file that has its own."""
     if request.aabb or request.near or request.far:
-        raise UsageProblem("--aabb, --near and --far are for files without a box, and this one has its own")
+        raise UsageProblem(
+            f"{request.path}: has a box of its own, and --aabb, --near and --far are for files without one; "
+            "leave them out"
+        )
 
 
 def unmoved(request: ImportRequest) -> list[str]:
@@ -195,6 +199,7 @@ def write(imported: Imported, request: ImportRequest, capture: Capture | None) -
         cameras = capture_camera_set(capture, surroundings=unbounded).content()
     up = None if imported.up == UP_Z else imported.up
     up = up if request.up is None else tuple(unit_vector(request.up).tolist())
-    graph = SceneGraph(tuple(nodes), generator=f"fusedrf {__version__}", cameras=cameras, up=up)
+    shown = {"cameras": cameras} if imported.framing is None or cameras else {"framing": imported.framing}
+    graph = SceneGraph(tuple(nodes), generator=f"fusedrf {__version__}", up=up, **shown)
     writer.write(request.output, graph, overwrite=request.overwrite)
     return graph

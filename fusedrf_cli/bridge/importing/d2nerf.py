@@ -26,6 +26,7 @@ from fusedrf_cli.bridge.importing.parts import (
 from fusedrf_cli.engine.encodings import warped_frequencies
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsField, PartsShape
+from fusedrf_cli.errors import UsageProblem
 
 TWIST = 6  # numbers that move a point
 READ = {
@@ -94,7 +95,7 @@ class Model:
         if time is None:
             return codes.mean(0)
         if not 0 <= time <= len(codes) - 1:
-            raise FormatError(
+            raise UsageProblem(
                 f"the scene moves: a time from 0 to {len(codes) - 1} (--time) should be given, found {time:g}"
             )
         i = min(int(time), max(len(codes) - 2, 0))

@@ -26,6 +26,7 @@ from fusedrf_cli.bridge.importing.parts import (
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.assembled.field import PartsShape
 from fusedrf_cli.engine.spaces import bounded, contracted_linf, space_of
+from fusedrf_cli.errors import UsageProblem
 
 FIELD = "field."
 MOST_SAMPLES = 512  # vertices along an axis by which rays are sampled
@@ -131,7 +132,7 @@ def at_time(planes: Sequence[np.ndarray], time: float | None) -> list[np.ndarray
     """The three planes of a scale, and for each axis the line (n, C) that its plane with time is then."""
     if time is None or not -1 <= time <= 1:
         found = "none" if time is None else f"{time:g}"
-        raise FormatError(f"the scene moves: a time from -1 to 1 (--time) should be given, found {found}")
+        raise UsageProblem(f"the scene moves: a time from -1 to 1 (--time) should be given, found {found}")
     still, lines = [], []
     for (_, b), plane in zip(pairs_of(planes), planes, strict=True):
         if b < 3:

@@ -46,6 +46,8 @@ class Imported:
     """By which several nodes are composed."""
     up: tuple[float, ...] = UP_Z
     """(3,) which way of its world is up."""
+    framing: tuple[float, ...] | None = None
+    """(6,) the box of its world that pictures show; None: all of it."""
 
 
 class Entries:

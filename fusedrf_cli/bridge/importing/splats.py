@@ -9,6 +9,7 @@ from formats.splats.reading import read_splats
 from formats.splats.splats import Splats
 from fusedrf_cli.bridge.importing.parts import Imported, ImportedNode
 from fusedrf_cli.bridge.memory import Memory
+from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.kinds.splats.device_functions import REACH
 from fusedrf_cli.engine.kinds.splats.field import SplatsField
 from fusedrf_cli.errors import InvalidInput
@@ -50,13 +51,15 @@ def fields_of(
         )
         for i, shell in enumerate(shells)
     ]
-    notes = [*notes, *splats.notes]
+    notes, framing = [*notes, *splats.notes], None
     if len(shells) > 1:
+        middle = placed_box(nodes[0].field.occupancy.look_at_box, nodes[0].object_to_world)
+        framing = tuple(middle.tolist())
         counts = ", ".join(f"{len(shell):,}" for shell in shells)
         notes.append(
             f"it becomes {len(shells)} fields that add up, from the middle outwards: {counts} splats"
         )
-    return Imported(nodes, notes, "add", splats.up)
+    return Imported(nodes, notes, "add", splats.up, framing)
 
 
 def field_of(splats: Splats, index: np.ndarray) -> SplatsField:

@@ -323,6 +323,8 @@ class FitRun:
             self.occupy(occupancy)
         if self.share() >= self.config.prune_low_density_from or not self.refreshes:
             rays_o, rays_d, *_ = self.pool.draw(current(OccupancyUpdateConfig).rays_that_judge)
+            if self.refreshes:  # while what is left can make up for it
+                self.field = registry.kind(self.config.kind).thinned(self.field)
             self.occupy(prune_low_density(self.field, rays_o, rays_d, self.config.near))
 
     def shown_cells(self) -> OccupancyGrid:

@@ -304,7 +304,8 @@ def marked_cells(
         ).astype(int)
         + 1
     )
-    if space is not bounded and grid.occupied.sum() * np.prod(points, dtype=float) > MOST_POINTS:
+    n_points = np.prod(points, dtype=float) * (1 if space is bounded else grid.occupied.sum())
+    if n_points > MOST_POINTS:  # cells far larger than the box's
         return reached_cells(grid, object_to_field, aabb, counts, space)
     steps = np.stack(np.meshgrid(*[np.linspace(0, 1, n) for n in points], indexing="ij"), -1).reshape(-1, 3)
     corners = grid.aabb[:3] + np.argwhere(grid.occupied) * grid.cell

@@ -2,10 +2,11 @@
 of them fit in a limit at the least error. Of what a field may lose, that goes first which saves most bytes
 for the error that it adds (greedy allocation of bits; Shoham and Gersho 1988)."""
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import islice
+from itertools import islice, product
 from math import exp, log
 
 from fusedrf_cli.engine.kinds.builder import StorageSetting
@@ -110,6 +111,16 @@ class FieldShares:
             for tried in (spacings, components):
                 yield from islice((one for one in tried if self.bytes(one) < size), 1)
 
+    def best(self, most: int) -> Share | None:
+        """Of all shares of at most so many bytes that of the least error; None where there are none."""
+        config, fitting = current(AllocationConfig), []
+        spacings, components = range(config.most_steps + 1), (None, *config.ranks) if self.ranked else (None,)
+        for precision, ranks in product(self.ladder, components):
+            fits = [Share(precision, n, ranks) for n in spacings]
+            first = bisect_left(fits, True, key=lambda share: self.bytes(share) <= most)
+            fitting += fits[first : first + 1]
+        return min(fitting, key=self.error, default=None)
+
     def smallest(self) -> int:
         """Bytes of the least share."""
         config = current(AllocationConfig)
@@ -143,12 +154,9 @@ def allocated(fields: Sequence[FieldShares], limit: int) -> list[Share]:
 
 
 def filled(fields: Sequence[FieldShares], shares: list[Share], sizes: list[int], limit: int) -> list[Share]:
-    """The shares with texels as much finer as the bytes left over allow, those of the largest error first."""
+    """The shares with what the bytes left over allow, those of the largest error first."""
     for i in sorted(range(len(fields)), key=lambda i: -fields[i].error(shares[i])):
-        others = sum(sizes) - sizes[i]
-        while shares[i].steps:
-            finer = replace(shares[i], steps=shares[i].steps - 1)
-            if others + fields[i].bytes(finer) > limit:
-                break
-            shares[i], sizes[i] = finer, fields[i].bytes(finer)
+        best = fields[i].best(limit - (sum(sizes) - sizes[i]))
+        if best is not None and fields[i].error(best) < fields[i].error(shares[i]):
+            shares[i], sizes[i] = best, fields[i].bytes(best)
     return shares

@@ -14,6 +14,7 @@ from formats.bundle import read_bundle
 from formats.errors import FormatError
 from formats.foreign.systems import open_checkpoint
 from fusedrf_cli.bridge.importing import d2nerf
+from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.main import cli
 from tests.bridge.importing.test_k_planes import stored
 from tests.formats.foreign.samples import flax_array
@@ -275,7 +276,7 @@ def test_without_a_time_what_stands_still_is_in_no_shadow(model, tmp_path):
 
 @pytest.mark.parametrize("time", [-1, 4.5, float("nan")])
 def test_a_time_that_there_is_not_is_named(tmp_path, time):
-    with pytest.raises(FormatError, match=r"a time from 0 to 4 \(--time\)"):
+    with pytest.raises(UsageProblem, match=r"a time from 0 to 4 \(--time\)"):
         d2nerf.read(written(MODELS["as run"], tmp_path), BOX, time)
 
 
@@ -369,5 +370,5 @@ def test_the_command_writes_a_group_whose_densities_add_up(tmp_path):
     assert group.composition == "add"
     assert [child.name for child in group.children] == ["hand-static", "hand-dynamic"]
     late = CliRunner().invoke(cli, [*words, "--time", "5", "-w"])
-    assert late.exit_code == 3 and "a time from 0 to 4 (--time) should be given, found 5" in late.output
+    assert late.exit_code == 2 and "a time from 0 to 4 (--time) should be given, found 5" in late.output
     assert CliRunner().invoke(cli, [*words[:4], "--time", "3", "-w"]).exit_code == 2  # nothing says where

@@ -12,6 +12,7 @@ from formats.foreign.systems import open_checkpoint
 from formats.records import FieldRecord, decode_field, encode_field
 from fusedrf_cli.bridge.importing import k_planes
 from fusedrf_cli.bridge.scene import make_field
+from fusedrf_cli.errors import UsageProblem
 
 from .hash_oracle import harmonics
 
@@ -215,7 +216,7 @@ def test_nothing_is_farther_outside_of_the_box_than_its_sides_are_long(tmp_path)
 
 @pytest.mark.parametrize("time", [None, -1.5, float("nan")])
 def test_a_scene_that_moves_needs_a_time(tmp_path, time):
-    with pytest.raises(FormatError, match=r"a time from -1 to 1 \(--time\)"):
+    with pytest.raises(UsageProblem, match=r"a time from -1 to 1 \(--time\)"):
         k_planes.read(written(MODELS["moving"], tmp_path), time)
 
 

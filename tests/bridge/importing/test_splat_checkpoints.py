@@ -351,5 +351,5 @@ def test_damaged_numbers_are_refused_or_read(system, tmp_path):
 
 
 def test_a_box_is_of_no_use(tmp_path):
-    with pytest.raises(UsageProblem, match="for files without a box"):
+    with pytest.raises(UsageProblem, match="for files without one"):
         verbs.import_field(save_3dgs(tmp_path, content()), tmp_path / "f.rfpack", aabb=(-1, -1, -1, 1, 1, 1))

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
@@ -12,6 +13,7 @@ from fusedrf_cli import verbs
 from fusedrf_cli.bridge.importing.splats import shells_of
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.python import open_scene
+from fusedrf_cli.requests import Input
 from tests.formats.splats.writers import content, sog_files, written, zipped
 
 
@@ -66,6 +68,25 @@ def test_one_field_is_learnt_of_what_does_not_fit_as_it_is(tmp_path):
     assert not (tmp_path / "none.rfpack").exists()
 
 
+def test_what_was_chosen_instead_of_nodes_goes_on(tmp_path, monkeypatch):
+    """By the very words of the run that was interrupted, which say no kind."""
+    centres = np.random.default_rng(0).uniform(-1, 1, (20_000, 3))
+    bundle, fused = tmp_path / "balls.rfpack", tmp_path / "fused.rfpack"
+    verbs.import_field(splat_file(tmp_path / "balls.splat", centres), bundle)
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    words = {"max_size": 300_000, "time_budget": 2}
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("fusedrf_cli.engine.distillation.distill.query_teacher", stop)
+        verbs.fuse(bundle, fused, **words)
+    assert fused.with_name("fused.rfpack.checkpoint").exists() and not fused.exists()
+    report = verbs.fuse(bundle, fused, **words, resume=True)
+    assert report["kind"] == "vm" and report["kind_because"] == "the run that went on had chosen it"
+    assert fused.exists() and not fused.with_name("fused.rfpack.checkpoint").exists()
+
+
 def test_what_lies_far_away_becomes_a_field_of_its_own(tmp_path):
     rng = np.random.default_rng(1)
     centres = np.concatenate([rng.uniform(-1, 1, (400, 3)), rng.uniform(-300, 300, (3, 3))])
@@ -77,6 +98,48 @@ def test_what_lies_far_away_becomes_a_field_of_its_own(tmp_path):
     points = torch.from_numpy(centres[[0, -1]])
     sigma, _ = open_scene(tmp_path / "room.rfpack").query(points, torch.tensor([[0.0, 0, 1]] * 2))
     assert (sigma.detach() > 1).all()
+
+
+def shown_share(picture: Path) -> float:
+    """Of the pixels of a picture over white, how many show anything."""
+    return float((imageio.imread(picture)[..., :3].min(-1) < 200).mean())
+
+
+def test_pictures_show_what_most_splats_are_whatever_lies_far_from_them(tmp_path):
+    """Of a bundle, of a scene that places it beside others, and of what is fused of that; what far splats
+    are cropped to takes no more memory than the others."""
+    rng = np.random.default_rng(1)
+    ball = rng.uniform(-1, 1, (600, 3))
+    alone, stray = tmp_path / "alone.rfpack", tmp_path / "stray.rfpack"
+    verbs.import_field(splat_file(tmp_path / "alone.splat", ball, 0.1), alone)
+    far = np.concatenate([ball, [[50, 50, 50], [-3e4, 0, 1e5]]])
+    verbs.import_field(splat_file(tmp_path / "stray.splat", far, 0.1), stray)
+    verbs.compose([Input(path=str(stray), translate=(3, 0, 0)), str(alone)], tmp_path / "pair.json")
+    verbs.compose([Input(path=str(stray), crop=(0, 0, 0, 4))], tmp_path / "cropped.json")
+    verbs.fuse(tmp_path / "pair.json", tmp_path / "fused.rfpack")
+    for scene, least in (("alone.rfpack", 0.1), ("stray.rfpack", 0.1), ("pair.json", 0.04),
+                         ("cropped.json", 0.03), ("fused.rfpack", 0.04)):  # fmt: skip
+        verbs.render(tmp_path / scene, tmp_path / "seen.png", size=(48, 48), overwrite=True)
+        assert shown_share(tmp_path / "seen.png") > least, scene
+
+
+def test_info_says_how_large_splats_are(tmp_path):
+    corners = np.array([[-1.0, -2, -3], [1, 2, 3]])
+    verbs.import_field(splat_file(tmp_path / "two.splat", corners, 0.1), tmp_path / "two.rfpack")
+    (node,) = verbs.info(tmp_path / "two.rfpack")["nodes"]
+    box = np.array(node["world_aabb"])
+    assert (box[:3] < corners[0] - 0.1).all() and (box[3:] > corners[1] + 0.1).all()
+    np.testing.assert_allclose(box.reshape(2, 3), corners, atol=0.8)
+
+
+def test_a_bundle_does_not_get_the_name_of_something_else(tmp_path):
+    file = splat_file(tmp_path / "two.splat", np.zeros((2, 3)))
+    with pytest.raises(UsageProblem, match=r"two.png: what is written is no .png file; .* NAME.rfpack"):
+        verbs.import_field(file, tmp_path / "two.png")
+    verbs.import_field(file, tmp_path / "two.rfpack")
+    with pytest.raises(UsageProblem, match=r"no .glb file; .* NAME.json"):
+        verbs.compose([tmp_path / "two.rfpack"], tmp_path / "scene.glb")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["two.rfpack", "two.splat"]
 
 
 def test_shells_hold_every_splat_once():
@@ -96,8 +159,8 @@ def test_a_file_without_splats_is_refused(tmp_path):
 @pytest.mark.parametrize(
     "words, say",
     [
-        ({"aabb": (-1, -1, -1, 1, 1, 1)}, "--aabb, --near and --far are for files without a box"),
-        ({"near": 1.0}, "--aabb, --near and --far are for files without a box"),
+        ({"aabb": (-1, -1, -1, 1, 1, 1)}, "--aabb, --near and --far are for files without one"),
+        ({"near": 1.0}, "--aabb, --near and --far are for files without one"),
         ({"up": (0, 0, 0)}, "0,0,0 is no direction"),
     ],
 )

@@ -326,4 +326,4 @@ def test_a_box_is_not_to_be_given_for_a_file_that_has_one(tmp_path):
     saved(Model(), tmp_path)
     words = "import", "scene.th", "-o", "a.rfpack", "--aabb", "-1,-1,-1,1,1,1"
     result = CliRunner().invoke(cli, [str(tmp_path / w) if "." in w and "," not in w else w for w in words])
-    assert result.exit_code == 2 and "this one has its own" in result.output
+    assert result.exit_code == 2 and "has a box of its own" in result.output

@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 import torch
 
+from formats.bundle import OpenBundle
 from formats.errors import FormatError
 from formats.foreign.systems import open_checkpoint
 from fusedrf_cli import verbs
+from fusedrf_cli.bridge.bundling import stored_bytes, unchanged_bytes
 from fusedrf_cli.bridge.importing import torch_ngp
+from fusedrf_cli.bridge.scene import load_scene
+from fusedrf_cli.bridge.sizes import BundleSizes
+from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.errors import InvalidInput
 
 from . import hash_oracle as oracle
@@ -317,6 +322,20 @@ def test_the_command_writes_what_it_shows(tmp_path):
     assert report["system"] == "torch-ngp" and any("is cut to" in note for note in report["notes"])
     found = oracle.asked(tmp_path / "f.rfpack", points, d)
     oracle.assert_alike(found, expected(model, state_of(model, False), points, d, False), 2e-3)
+
+
+def test_rows_that_cascades_share_count_among_the_bytes_of_each(tmp_path):
+    """What a file is foretold to take holds all numbers of a field, and all of a bundle each member once."""
+    verbs.import_field(written(Model(bound=8), tmp_path).path, output=tmp_path / "f.rfpack")
+    loaded = load_scene(str(tmp_path / "f.rfpack"))
+    assert len(loaded.fields) > 1
+    for source in loaded.fields:
+        field = opened(source.placed.field)
+        numbers = sum(np.asarray(array).nbytes for array in field.state()[0].values())
+        assert BundleSizes().exactly(field, "float32") > numbers
+        assert stored_bytes(loaded)[id(source.placed.field)] > numbers
+    headers = OpenBundle(tmp_path / "f.rfpack").headers
+    assert unchanged_bytes(loaded) == sum(header.size for header in headers.values())
 
 
 @pytest.mark.parametrize(

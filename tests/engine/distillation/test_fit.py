@@ -13,9 +13,12 @@ from fusedrf_cli.engine.distillation.fit import FitRun, fit, occupancy_of
 from fusedrf_cli.engine.distillation.ray_dataset import Pictures, RayDataset
 from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, texels
+from fusedrf_cli.engine.kinds.builder import StorageSetting
+from fusedrf_cli.engine.kinds.hash.field import HashConfig
 from fusedrf_cli.engine.rendering.cameras import Camera, look_at, orbit, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
+from fusedrf_cli.engine.settings import using
 from tests.analytic.export import way_of
 from tests.engine.conftest import BOX, THIRTY_TWO, Ball, random_vm
 
@@ -150,6 +153,23 @@ def test_a_detail_fades_where_photos_say_little_of_it(capture):
     assert faded(8, 1 << 10) == pytest.approx(SETTINGS.fade * (4 * 1024 / (8 * 24 * 24)) ** 2)
     assert faded(4, 1 << 10) == pytest.approx(4 * faded(8, 1 << 10))
     assert faded(1, 1 << 16) == SETTINGS.most_faded and faded(1, 0) == 0
+
+
+@pytest.mark.slow
+def test_a_hash_grid_ends_with_the_rows_that_say_most(capture):
+    """What goes while it learns is made up for: views are as good as with all rows."""
+    settings = replace(SETTINGS, kind="hash", storage=StorageSetting())
+    unseen = scattered(BOX, 4, 24, 24, seed=3)
+    white = pictures(unseen) / 255
+    white = white[..., :3] * white[..., 3:] + 1 - white[..., 3:]
+    shown, held = [], []
+    for kept in (0.6, 1.0):
+        with using(HashConfig(kept=kept)):
+            field = fit(*capture, BOX, settings)
+        seen = np.stack([render_image(field, camera).over((1, 1, 1)) for camera in unseen])
+        shown.append(psnr(seen, white))
+        held.append(float((field.sections()["density_rows"] != 0).any(1).double().mean()))
+    assert 0.3 < held[0] <= 0.6 < held[1] and shown[0] > shown[1] - 0.5
 
 
 def test_the_same_seed_gives_the_same_bits(capture):

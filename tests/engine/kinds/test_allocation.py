@@ -86,6 +86,13 @@ def test_bytes_left_over_make_texels_finer():
         assert 0.6 * limit < totals(fields, allocated(fields, limit))[0] <= limit
 
 
+def test_one_field_gets_the_best_share_that_fits():
+    """Whichever share saves most for its error by the way."""
+    one = field(100_000, noise=1.0, texture=0.02)
+    for limit in np.geomspace(900, 99_000, 40).astype(int):
+        assert totals([one], allocated([one], limit))[1] == pytest.approx(best([one], limit))
+
+
 def test_errors_between_those_measured_are_powers_of_the_spacing():
     """Exact where the error is one; few spacings are made."""
     calls, step = [], AllocationConfig().voxel_step

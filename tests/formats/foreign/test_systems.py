@@ -3,6 +3,7 @@
 import gzip
 import os
 import random
+import re
 import shutil
 
 import msgpack
@@ -230,3 +231,23 @@ def test_damaged_checkpoints_are_refused_or_read(system, tmp_path):
             assert str(error).isprintable()
             outcomes.add("refused")
     assert "refused" in outcomes
+
+
+@pytest.mark.parametrize(
+    "entries, lacking",
+    [
+        (lambda table: table["state_dict"], "kwargs, state_dict/density_line.0, state_dict/app_line.0"),
+        (lambda table: {"model": table}, "kwargs, state_dict/density_line.0, state_dict/app_line.0"),
+        (
+            lambda table: table | {"state_dict": {f"module.{k}": v for k, v in table["state_dict"].items()}},
+            "state_dict/density_line.0, state_dict/app_line.0",
+        ),
+    ],
+)
+def test_arrays_that_lie_elsewhere_are_said_to_be_a_systems(tmp_path, entries, lacking):
+    lines = state("density_line.0", "density_plane.0", "app_line.0", "app_plane.0")
+    torch.save(entries({"kwargs": {"aabb": weights(2, 3)}, "state_dict": lines}), tmp_path / "a.th")
+    with pytest.raises(
+        UnknownCheckpoint, match=f"as TensoRF names them, but {re.escape(lacking)} lack: give"
+    ):
+        open_checkpoint(tmp_path / "a.th")

@@ -379,6 +379,15 @@ def test_a_file_that_was_replaced_is_noticed(tmp_path):
         tensor.array()
 
 
+def test_a_file_of_the_old_layout_that_was_cut_short_says_so(tmp_path):
+    path = tmp_path / "a.pth"
+    torch.save({"a": torch.arange(300.0), "b": torch.arange(9.0)}, path, **OLD)
+    size = path.stat().st_size
+    path.write_bytes(path.read_bytes()[: size - 500])
+    with pytest.raises(BadCheckpoint, match=f"is cut off: it should go on to byte .* {size - 500:,} bytes"):
+        read_torch(path)
+
+
 def test_what_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(zip_file, "FREE", 1 << 16)
     bomb = torch_zip(pickle.dumps({"a": "x" * (8 << 20)}, 2), method=zipfile.ZIP_DEFLATED)

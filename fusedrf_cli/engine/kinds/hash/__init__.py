@@ -9,9 +9,10 @@ from fusedrf_cli.engine.fields.computed import packed_bits
 from fusedrf_cli.engine.fields.stored_rows import RUN, StoredRows
 from fusedrf_cli.engine.kinds.box_kind import BoxKind
 from fusedrf_cli.engine.kinds.builder import Contents, Plan, Section, StorageSetting
-from fusedrf_cli.engine.kinds.hash.field import BASE, ROWS, HashField, HashShape
+from fusedrf_cli.engine.kinds.hash.field import BASE, ROWS, HashConfig, HashField, HashShape
 from fusedrf_cli.engine.kinds.hash.trimming import rows_used, with_fewer_rows, without_unasked
 from fusedrf_cli.engine.kinds.reduction import Reduction
+from fusedrf_cli.engine.settings import current
 
 MOST_ROWS = 19  # log2, of a level: a step looks through the gradients of all
 
@@ -56,6 +57,12 @@ class HashKind(BoxKind):
     def trimmed(self, field: HashField) -> HashField:
         """See hash/trimming.py."""
         return without_unasked(field)
+
+    def thinned(self, field: HashField) -> HashField:
+        """See Kind: with a share of the rows (`HashConfig.kept`)."""
+        if field.shape.features % RUN:
+            return field
+        return with_fewer_rows(field, int(current(HashConfig).kept * rows_used(field)))
 
     def describe(self, field: HashField) -> dict:
         """Texels per axis, levels that they leave in, and rows that a file holds."""

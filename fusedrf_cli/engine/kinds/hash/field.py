@@ -10,6 +10,7 @@ from fusedrf_cli.engine.decoders import density_linear, sh_mlp
 from fusedrf_cli.engine.encodings import hash_grid, trunk_features
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot, check_counts
 from fusedrf_cli.engine.fields.box import ParameterBlock
+from fusedrf_cli.engine.fields.computed import runs_of
 from fusedrf_cli.engine.kernels.primitives import LINE
 from fusedrf_cli.engine.settings import current
 
@@ -24,6 +25,8 @@ class HashConfig:
     rows_rate: float = 2.0
     density_rate: float = 1.0
     network_rate: float = 0.1
+    kept: float = 0.6
+    """Of the rows, late in learning from photos."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,13 @@ class HashField(AssembledField):
             return None
         lines = self.sections()[ROWS].detach().cpu().view(-1, LINE)
         return LINE * np.flatnonzero(lines.any(1).numpy())
+
+    @classmethod
+    def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "HashField":
+        """See BoxField; rows that a file leaves out are not learnt either."""
+        field = super().from_state(arrays, metadata)
+        field.few_rows = runs_of(ROWS) in arrays
+        return field
 
     @property
     def used_levels(self) -> list[dict]:
