@@ -75,7 +75,8 @@ def reading(read):
 
 
 def edited(path: str) -> None:
-    edit = editing.Edit(SimpleNamespace(fused=path, memory=None), Silence())
+    request = SimpleNamespace(fused=path, output=f"{path}.edited", undoable=False, memory=None)
+    edit = editing.Edit(request, Silence())
     assert isinstance(edit.draft.names, set)
     deleting.Deletion(edit, (), False).remaining(np.array([-1e9] * 3 + [1e9] * 3))
 

@@ -11,6 +11,7 @@ from fusedrf_cli.engine.encodings import hash_grid, trunk_features
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot, check_counts
 from fusedrf_cli.engine.fields.box import ParameterBlock
 from fusedrf_cli.engine.fields.computed import runs_of
+from fusedrf_cli.engine.fields.stored_rows import RUN
 from fusedrf_cli.engine.kernels.primitives import LINE
 from fusedrf_cli.engine.settings import current
 
@@ -89,7 +90,7 @@ class HashField(AssembledField):
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "HashField":
         """See BoxField; rows that a file leaves out are not learnt either."""
         field = super().from_state(arrays, metadata)
-        field.few_rows = runs_of(ROWS) in arrays
+        field.few_rows = runs_of(ROWS) in arrays and field.shape.features % RUN == 0
         return field
 
     @property
