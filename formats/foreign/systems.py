@@ -115,10 +115,9 @@ def _likeness(names: list[str]) -> str:
             inner = [word.rpartition("/")[2] for word in wanted if "/" in word]
             if inner and all(fnmatch.filter(last, word) for word in inner):
                 lacking = [word.partition(":")[0] for word in wanted if not fnmatch.filter(names, word)]
-                return (
-                    f"its arrays are named as {system.title} names them, but {listed(lacking, 3)} lack: give "
-                    "the file as that saves it"
-                )
+                named = f"its arrays are named as {system.title} names them"
+                if lacking:  # else it has what the system's own files do not
+                    return f"{named}, but {listed(lacking, 3)} lack: give the file as that saves it"
     return ""
 
 

@@ -46,11 +46,16 @@ def texels_of(resolution: tuple[int, int, int], scales: list | int) -> list[tupl
     return scales
 
 
+def count_of(scales: list | int) -> int:
+    """How many grids there are."""
+    return scales if isinstance(scales, int) else len(scales)
+
+
 def sizes(
     features: int, scales: list | int, summed: bool = False, lines: bool = False, margin: float = 0.0
 ) -> dict[str, int | float]:
     """See encodings; scratch holds what is sent back to the factors of a grid."""
-    factors, count = 6 if lines else 3, scales if isinstance(scales, int) else len(scales)
+    factors, count = 6 if lines else 3, count_of(scales)
     return {
         "FEATURES": features, "SCALES": count, "FACTORS": factors, "SUMMED": int(summed),
         "WIDTH": features * (1 if summed else count), "ROOM": factors * features,
@@ -83,7 +88,7 @@ def reference(
 ) -> torch.Tensor:  # fmt: skip
     """See encodings."""
     unit, made = ((unit - margin) / (1 - 2 * margin)).clamp(0, 1), []
-    for s in range(scales if isinstance(scales, int) else len(scales)):
+    for s in range(count_of(scales)):
         product = 1
         for m, (a, b) in enumerate(AXES[:3]):
             plane = sections[f"plane_{s}_{m}"]
@@ -99,8 +104,7 @@ def bound(
 ) -> torch.Tensor:
     """See encodings."""
     peaks = torch.stack([largest(view, kept=1) for view in sections.values()])
-    count = scales if isinstance(scales, int) else len(scales)
-    products = peaks.view(count, -1, features).prod(1)
+    products = peaks.view(count_of(scales), -1, features).prod(1)
     return products.sum(0) if summed else products.view(-1)
 
 

@@ -251,3 +251,13 @@ def test_arrays_that_lie_elsewhere_are_said_to_be_a_systems(tmp_path, entries, l
         UnknownCheckpoint, match=f"as TensoRF names them, but {re.escape(lacking)} lack: give"
     ):
         open_checkpoint(tmp_path / "a.th")
+
+
+def test_a_scene_that_moves_is_not_said_to_lack_anything(tmp_path):
+    """torch-ngp's networks of moving scenes have all that the others have, and one more."""
+    path = write("torch-ngp", tmp_path)
+    table = torch.load(path, weights_only=False)
+    table["model"] |= state("deform_net.0.weight")
+    torch.save(table, path)
+    with pytest.raises(UnknownCheckpoint, match="which no known system writes; known are TensoRF"):
+        open_checkpoint(path)

@@ -6,7 +6,7 @@ import torch
 
 from fusedrf_cli.engine.encodings.hash_grid import FINER
 from fusedrf_cli.engine.fields.computed import packed_bits
-from fusedrf_cli.engine.fields.stored_rows import RUN, StoredRows
+from fusedrf_cli.engine.fields.stored_rows import StoredRows
 from fusedrf_cli.engine.kinds.box_kind import BoxKind
 from fusedrf_cli.engine.kinds.builder import Contents, Plan, Section, StorageSetting
 from fusedrf_cli.engine.kinds.hash.field import BASE, ROWS, HashConfig, HashField, HashShape
@@ -49,7 +49,7 @@ class HashKind(BoxKind):
         """See Kind: with fewer rows, those of the largest numbers: half as many for texels four times as
         wide."""
         held, own = outline.told.first(rows_used(outline)), outline.voxel_size
-        if voxel <= own or outline.shape.features % RUN:
+        if voxel <= own or not outline.shape.lines_are_runs:
             return Reduction(contents_of(outline, held), lambda field: field, True)
         few = held.spread(int(held.count * math.sqrt(own / voxel)))
         return Reduction(contents_of(outline, few), lambda field: with_fewer_rows(field, few.count), False)
@@ -60,9 +60,8 @@ class HashKind(BoxKind):
 
     def thinned(self, field: HashField) -> HashField:
         """See Kind: with a share of the rows (`HashConfig.kept`)."""
-        if field.shape.features % RUN:
-            return field
-        return with_fewer_rows(field, int(current(HashConfig).kept * rows_used(field)))
+        kept = int(current(HashConfig).kept * rows_used(field))
+        return with_fewer_rows(field, kept) if field.shape.lines_are_runs else field
 
     def describe(self, field: HashField) -> dict:
         """Texels per axis, levels that they leave in, and rows that a file holds."""

@@ -50,6 +50,11 @@ class HashShape:
         )  # fmt: skip
 
     @property
+    def lines_are_runs(self) -> bool:
+        """Whether the rows of a run fill cache lines: then they can be left out, and stay so."""
+        return RUN * self.features % LINE == 0
+
+    @property
     def grids(self) -> list[dict]:
         """The levels, from the coarsest to the finest."""
         growth = (self.finest / BASE) ** (1 / max(self.levels - 1, 1))
@@ -90,7 +95,7 @@ class HashField(AssembledField):
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "HashField":
         """See BoxField; rows that a file leaves out are not learnt either."""
         field = super().from_state(arrays, metadata)
-        field.few_rows = runs_of(ROWS) in arrays and field.shape.features % RUN == 0
+        field.few_rows = runs_of(ROWS) in arrays and field.shape.lines_are_runs
         return field
 
     @property

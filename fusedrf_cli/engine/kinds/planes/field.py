@@ -15,13 +15,12 @@ from fusedrf_cli.engine.settings import current
 
 @dataclass(frozen=True)
 class PlanesConfig:
-    """How such a field begins and learns; rates are relative to the optimiser's."""
+    """How such a field begins and learns."""
 
     first: tuple[float, float] = (0.1, 0.5)
     """Between which an untrained field's factors lie, as K-Planes begins: all products have one sign."""
-    planes_rate: float = 1.0
-    density_rate: float = 1.0
     network_rate: float = 0.1
+    """Relative to the optimiser's."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +46,13 @@ class PlanesField(AssembledField):
     @classmethod
     def slots_of(cls, shape: PlanesShape) -> dict[str, Slot]:
         """See AssembledField."""
-        config, width = current(PlanesConfig), shape.levels * shape.features
+        width, rate = shape.levels * shape.features, current(PlanesConfig).network_rate
         products = {"features": shape.features, "scales": shape.levels}
         return {
-            "density": Slot(planes, products, "density_", config.planes_rate),
+            "density": Slot(planes, products, "density_"),
             "colour": Slot(trunk_features, {"outputs": width}),
-            "sigma": Slot(density_linear, {"width": width}, "sigma_", config.density_rate),
-            "rgb": Slot(sh_mlp, {"width": width, "hidden": shape.hidden}, "rgb_", config.network_rate),
+            "sigma": Slot(density_linear, {"width": width}, "sigma_"),
+            "rgb": Slot(sh_mlp, {"width": width, "hidden": shape.hidden}, "rgb_", rate),
         }
 
     @classmethod
