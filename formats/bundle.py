@@ -219,7 +219,8 @@ def shared_members(
 def read_summary(path: Path | str) -> dict:
     """What `info` reports of a bundle or a plain scene.json, JSON-able; arrays are checked by CRC-32 alone.
 
-    Boxes are (6,) lists: `aabb` in the object's frame, `world_aabb` the box around its eight placed corners.
+    Boxes are (6,) lists: `aabb` in the frame of the file that the object came in, `world_aabb` the box
+    around its eight placed corners.
     `objects` are what a fused field was made of (formats/object_summary.py); a plain scene has nodes alone.
     """
     with open_input(path) as file:
@@ -314,7 +315,9 @@ def _scene_summary(scene: SceneGraph, headers: dict[str, FieldHeader]) -> dict:
     nodes = []
     for node, depth, object_to_world in scene.walk():
         header = headers.get(node.field)
-        aabb = header.box if header else None
+        aabb = own = header.box if header else None
+        if aabb and node.source_matrix is not None:
+            own = world_aabb(aabb, np.array(node.source_matrix))
         nodes.append(
             {
                 "name": node.name,
@@ -324,7 +327,7 @@ def _scene_summary(scene: SceneGraph, headers: dict[str, FieldHeader]) -> dict:
                 "kind": header.kind if header else None,
                 "background": node.background,
                 "object_to_world": object_to_world.tolist(),
-                "aabb": aabb,
+                "aabb": own,
                 "world_aabb": world_aabb(aabb, object_to_world) if aabb else None,
             }
         )

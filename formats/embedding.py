@@ -79,7 +79,8 @@ def in_place_of(node: Node, nodes: tuple[Node, ...], rule: str, own_rule: str) -
                 return replace(node, source=None, field=only.field)
             if "crop" not in node.showing:  # it lies in the node's own frame
                 placement = placement_of(node.node_to_parent @ only.node_to_parent)
-                return replace(node, source=None, field=only.field, placement=placement)
+                own = only.node_to_parent.tolist()
+                return replace(node, source=None, field=only.field, placement=placement, source_matrix=own)
     return holding(node, nodes, rule, own_rule)
 
 

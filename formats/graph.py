@@ -160,6 +160,18 @@ def shown(node: Node, showing: dict) -> Node:
     return replace(node, showing={key: value for key, value in words.items() if value is not None})
 
 
+def cropped_as(node: Node, crop: Sequence[float] | None, names: set[str]) -> Node:
+    """A node with another crop, which lies in the frame of the file that it stands for; None: without. Where
+    that is not its own frame, it comes into a group, of a name that no node has, which is taken from now
+    on."""
+    if node.source_matrix is None or crop is None:
+        return shown(node, {"crop": crop})
+    placed = replace(node, placement=placement_of(np.array(node.source_matrix)))
+    group = free_name(f"{node.name}/cropped", names)
+    at = placement_of(node.source_to_parent)
+    return Node(group, None, None, at, children=(placed,), showing={"crop": list(crop)})
+
+
 def cropped(node: Node, crops: Sequence[Crop], names: set[str]) -> Node:
     """A node of which only what crops of its frame hold is shown. Where these lie in other frames than its
     own, it is in groups that are cropped, of names that no node has, which are taken from now on."""

@@ -33,6 +33,8 @@ class DistilledNode(msgspec.Struct):
     source: str = ""
     sha256: str = ""
     background: bool = False
+    source_matrix: Matrix4 | None = None
+    """See `Node`."""
 
 
 class Source(msgspec.Struct):
@@ -79,7 +81,8 @@ def check_history(scene: SceneGraph, path: str) -> None:
             msgspec.convert(entry.get("names", []), list[str])
             entries = list(msgspec.convert(entry.get("sources", {}), dict[str, Source]).values())
             for node in msgspec.convert(entry.get("nodes", []), list[DistilledNode]):
-                check_affine(np.array(node.object_to_world), f"'{node.name}'")
+                for matrix in (node.object_to_world, node.source_matrix or np.eye(4)):
+                    check_affine(np.array(matrix), f"'{node.name}'")
                 entries.append(node)
             if not all(one.source.isprintable() for one in entries):
                 raise ValueError("a source that is no path")

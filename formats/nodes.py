@@ -44,6 +44,9 @@ class Node:
     """What is shown of it and of its children, as it was written: see `Leaf`."""
     composition: str | None = None
     """The rule by which what is in it is one field; None: that of what it is in."""
+    source_matrix: list[list[float]] | None = None
+    """(4, 4) by which the field lay in the file that the node stands for, where not as it is; the placement
+    holds it already."""
     node_to_parent: np.ndarray = dataclasses.field(init=False, compare=False, repr=False)
 
     def __post_init__(self):
@@ -58,7 +61,27 @@ class Node:
             raise BadSchema(
                 f"node {self.name!r}: composition {self.composition!r} is neither 'max' nor 'add'"
             )
+        if self.source_matrix is not None:
+            check_affine(
+                _numbers(self.source_matrix, (4, 4), self.name, "source_matrix"), f"node {self.name!r}"
+            )
         object.__setattr__(self, "node_to_parent", matrix)
+
+    @property
+    def source_to_parent(self) -> np.ndarray:
+        """(4, 4) by which the frame of the file that it stands for lies in its parent's; its own frame's,
+        where there is no other."""
+        return source_placement(self.node_to_parent, self.source_matrix)
+
+
+def source_placement(object_to_world: np.ndarray, source_matrix: list[list[float]] | None) -> np.ndarray:
+    """Where the frame of a file lies of which a field is that lay in it by a (4, 4), and lies by another one
+    now; None: it lay in it as it is."""
+    if source_matrix is None:
+        return object_to_world
+    at = object_to_world @ np.linalg.inv(source_matrix)
+    at[3] = 0, 0, 0, 1
+    return at
 
 
 def multiplied(one: Sequence[float], other: Sequence[float]) -> tuple[float, float, float]:
@@ -85,6 +108,8 @@ class Leaf:
     """It is empty outside of any of them."""
     groups: tuple[tuple[str, str], ...] = ()
     """The nodes around it that have a rule of their own, from the root down, and their rules."""
+    source_matrix: list[list[float]] | None = None
+    """See `Node`."""
 
     @property
     def whole(self) -> bool:

@@ -47,7 +47,8 @@ from formats.other_files import HEAD, not_a_bundle
 from formats.safe_input import open_input, parse_json, read_input
 
 FORMAT = "rfpack"
-VERSION = "1.5"
+VERSION = "1.6"
+UPRIGHT_VERSION = "1.5"  # of scenes that say which way is up
 RULED_VERSION = "1.4"  # of scenes that require RULES
 FAR_VERSION = "1.3"  # of scenes that require FAR
 SHOWING_VERSION = "1.2"  # of scenes that show a node otherwise than it is
@@ -92,6 +93,7 @@ class NodeSchema(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True)
     opacity: Share | msgspec.UnsetType = msgspec.UNSET
     tint: Tint | msgspec.UnsetType = msgspec.UNSET
     composition: Literal["max", "add"] | msgspec.UnsetType = msgspec.UNSET
+    source_matrix: Matrix4 | msgspec.UnsetType = msgspec.UNSET
     children: list["NodeSchema"] = []
 
 
@@ -171,7 +173,7 @@ class SceneGraph:
                 crops = (*crops, Crop(tuple(node.showing["crop"]), np.eye(4)))
             if node.field is not None or node.source is not None:
                 placed = node.name, node.field, node.source, object_to_world, node.background
-                leaves.append(Leaf(*placed, visible, opacity, tint, crops, groups))
+                leaves.append(Leaf(*placed, visible, opacity, tint, crops, groups, node.source_matrix))
             for child in reversed(node.children):
                 all_crops = tuple(crop.within(child.node_to_parent) for crop in crops)
                 shown = visible, opacity, tint, all_crops, groups
@@ -252,6 +254,8 @@ def dump_scene(scene: SceneGraph) -> bytes:
     if requires:
         least = RULED_VERSION if RULES in requires else FAR_VERSION
     if upright:
+        least = UPRIGHT_VERSION
+    if any(node.source_matrix is not None for node, _, _ in scene.walk()):
         least = VERSION
     content = {
         "format": FORMAT,
@@ -392,6 +396,7 @@ def _build_node(content: dict) -> Node:
         {key: value for key, value in content.items() if key not in NODE_KEYS},
         {key: content[key] for key in SHOWING_KEYS if key in content},
         content.get("composition"),
+        content.get("source_matrix"),
     )
 
 
@@ -404,6 +409,8 @@ def _node_content(node: Node) -> dict:
     content |= {key: node.showing[key] for key in SHOWING_KEYS if key in node.showing}
     if node.composition is not None:
         content["composition"] = node.composition
+    if node.source_matrix is not None:
+        content["source_matrix"] = node.source_matrix
     content |= {key: node.extras[key] for key in sorted(node.extras)}
     if node.children:
         content["children"] = [_node_content(child) for child in node.children]

@@ -27,11 +27,11 @@ from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.builder import (
     NOTHING,
     DirectBuilder,
-    DistilConfig,
     DistilledBuilder,
     Plan,
     StorageSetting,
 )
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig
 from fusedrf_cli.engine.kinds.instances import distinct_fields
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import render_rays

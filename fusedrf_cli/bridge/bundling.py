@@ -2,7 +2,7 @@
 history that tells what they were made of."""
 
 import os
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,11 +37,11 @@ class FusedBundle:
         that cannot be written."""
         self.request, self.loaded, self.composed, self.learnt = request, scene.loaded, scene.composed, learnt
         self.kept = {f.member: f.bundle for f in self.loaded.fields} if request.keep_sources else {}
-        self.nodes = history_nodes(self.loaded, request.output, self.kept)
         whole = named_graph(request, everything)
         self.hidden = [leaf.name for leaf in whole.leaves() if not leaf.visible]
         """Nodes that are left out."""
         self.graph = with_shown(whole, everything, self.loaded)
+        self.nodes = [self.history_node(leaf, source) for leaf, source in self.leaves]
         self.framing: tuple[float, ...] | None = None
         self.cameras: dict | None = None
 
@@ -104,7 +104,8 @@ class FusedBundle:
         name = free_name(source.placed.name, {LEARNT})
         leaf = next(leaf for leaf, f in self.leaves if f is source)
         at = placement_of(leaf.object_to_world)
-        node = Node(name, own, None, at, True, showing=showing_of(stays))
+        shown = {"showing": showing_of(stays), "source_matrix": leaf.source_matrix}
+        node = Node(name, own, None, at, True, **shown)
         at = placement_of(placement(self.composed.origin) @ learnt.object_to_world)
         return SceneGraph((node, Node(LEARNT, member, None, at)))
 
@@ -137,6 +138,23 @@ class FusedBundle:
     def background_source(self) -> SourceField:
         """The source that is unbounded."""
         return next(f for f in self.loaded.fields if f.placed.unbounded)
+
+    def history_node(self, leaf: Leaf, f: SourceField) -> dict:
+        """What a history entry says of a source: name, placement, box, path from the output's folder,
+        checksum, kept member."""
+        node = {
+            "name": f.placed.name,
+            "object_to_world": f.placed.object_to_world.tolist(),
+            "aabb": f.placed.aabb.tolist(),
+            "field": f.member,
+            "background": f.background,
+            "kept": f.member in self.kept and f.whole,
+        }
+        if f.whole:  # an edit reads it again as it is
+            folder = Path(self.request.output).resolve().parent
+            path = os.path.relpath(f.bundle.path.resolve(), folder)
+            node |= {"source": path, "sha256": f.bundle.sha256}
+        return node if leaf.source_matrix is None else node | {"source_matrix": leaf.source_matrix}
 
     def sources_of(self, graph: SceneGraph) -> dict[str, dict]:
         """What the members of a graph were made of that are not those of their sources."""
@@ -215,23 +233,3 @@ def unchanged_bytes(loaded: LoadedScene) -> int | None:
     for f in loaded.fields:
         sizes |= f.bundle.sizes(f.member)
     return sum(sizes.values())
-
-
-def history_nodes(scene: LoadedScene, output: str, kept_members: Container[str]) -> list[dict]:
-    """What a history entry says of every source: name, placement, box, path from the output's folder,
-    checksum, kept member.
-    """
-    folder, nodes = Path(output).resolve().parent, []
-    for f in scene.fields:
-        node = {
-            "name": f.placed.name,
-            "object_to_world": f.placed.object_to_world.tolist(),
-            "aabb": f.placed.aabb.tolist(),
-            "field": f.member,
-            "background": f.background,
-            "kept": f.member in kept_members and f.whole,
-        }
-        if f.whole:  # an edit reads it again as it is
-            node |= {"source": os.path.relpath(f.bundle.path.resolve(), folder), "sha256": f.bundle.sha256}
-        nodes.append(node)
-    return nodes

@@ -261,7 +261,9 @@ def released(deletion: Deletion, name: str, new_name: str) -> Node:
                 nodes.append(Node(f"{new_name}/{number}", member, None, at, showing=showing_of(holder)))
     if not nodes:
         raise InvalidInput(f"{draft.path}: there is nothing of '{name}' in its field; delete it")
-    return replace(nodes[0], name=new_name) if len(nodes) == 1 else Node(new_name, children=tuple(nodes))
+    if len(nodes) > 1:
+        return Node(new_name, children=tuple(nodes))
+    return replace(nodes[0], name=new_name, source_matrix=entry.get("source_matrix"))
 
 
 def boxes_overlap(one: np.ndarray, other: np.ndarray) -> bool:

@@ -38,7 +38,8 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.resolution_report import ResolutionConfig, ResolutionReport
 from fusedrf_cli.engine.fields.base import is_occupied
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.builder import BuildRequest, DistilConfig, DistilledBuilder, TooSmall
+from fusedrf_cli.engine.kinds.builder import BuildRequest, DistilledBuilder, TooSmall
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.rendering.metrics import PSNR_CAP
 from fusedrf_cli.engine.settings import current

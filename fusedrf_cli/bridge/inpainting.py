@@ -28,7 +28,8 @@ from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, mapped, placement
 from fusedrf_cli.engine.kinds import field_cutting, registry
-from fusedrf_cli.engine.kinds.builder import DistilConfig, StorageSetting
+from fusedrf_cli.engine.kinds.builder import StorageSetting
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.selection.cells import CellConfig, CellGrid, Selection

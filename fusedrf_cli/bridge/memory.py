@@ -22,7 +22,8 @@ from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.teacher import expected_points
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, cell_counts
-from fusedrf_cli.engine.kinds.builder import DistilConfig, DistilledBuilder, Plan
+from fusedrf_cli.engine.kinds.builder import DistilledBuilder, Plan
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig
 from fusedrf_cli.engine.rendering.volume import RenderConfig
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import ResourceProblem
@@ -218,7 +219,8 @@ def together(*fits: Mapping[str, float]) -> dict[str, float]:
 def teaching(settings: DistilConfig, points: int) -> dict[str, float]:
     """What is asked of the teachers."""
     config = current(MemoryConfig)
-    return {"the teachers' answers": settings.rays * config.per_ray + points * config.per_point}
+    rays = max(settings.rays, settings.rgb_rays or 0)
+    return {"the teachers' answers": rays * config.per_ray + points * config.per_point}
 
 
 def rays_to_learn_from(rays: int) -> dict[str, float]:

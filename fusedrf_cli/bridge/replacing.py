@@ -3,6 +3,7 @@
 import numpy as np
 
 from formats.graph import changed, chosen, moved, with_nodes
+from formats.nodes import source_placement
 from formats.scene import Node
 from fusedrf_cli.bridge.deleting import EMPTIED, Deletion
 from fusedrf_cli.bridge.editing import Edit, brought
@@ -24,7 +25,7 @@ def replace(request: ReplaceRequest, progress) -> dict:
 
         def standing(node: Node, parent: np.ndarray) -> tuple[Node, ...]:
             new = brought(draft, request, name, np.eye(4), node.background)
-            return (moved(new, np.eye(4), node.node_to_parent),)
+            return (moved(new, np.eye(4), node.source_to_parent),)
 
         draft.graph = changed(draft.graph, {name}, standing)
         return edit.done("replaced", [name], chosen(draft.graph, {name}), (name,))
@@ -33,7 +34,8 @@ def replace(request: ReplaceRequest, progress) -> dict:
 def instead_of_distilled(edit: Edit, request: ReplaceRequest) -> dict:
     """Cut an object out of the field that it was distilled into, and put the other one where it stood."""
     draft, name = edit.draft, request.name
-    at = np.asarray(draft.inside[name]["object_to_world"], np.float64)
+    entry = draft.inside[name]
+    at = source_placement(np.asarray(entry["object_to_world"], np.float64), entry.get("source_matrix"))
     deletion = Deletion(edit, (name,), request.allow_outside)
     deletion.cut()
     node = brought(draft, request, name, at)

@@ -82,7 +82,8 @@ def with_sources(
     scene = with_leaves(scene, with_source)
     for name, entry in inside.items():
         matrix = np.asarray(entry["object_to_world"], np.float64)
-        node = Node(name, None, None, placement_of(matrix), bool(entry.get("background")))
+        own = bool(entry.get("background")), entry.get("source_matrix")
+        node = Node(name, None, None, placement_of(matrix), own[0], source_matrix=own[1])
         if own := placed(name, entry):
             scene = with_nodes(scene, [in_place_of(node, own, scene.composition, RULE)])
     composition = scene.history[0].get("composition", "max") if inside else scene.composition

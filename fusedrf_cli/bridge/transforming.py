@@ -4,7 +4,7 @@ distilled into a field with others becomes a node first, with the numbers of its
 import numpy as np
 
 from formats.bundle import read_summary
-from formats.graph import changed, chosen, moved, renamed, shown, with_nodes
+from formats.graph import changed, chosen, cropped_as, moved, renamed, shown, with_nodes
 from formats.scene import Node
 from fusedrf_cli.bridge.deleting import EMPTIED, Deletion, released
 from fusedrf_cli.bridge.editing import SAME_BITS, Edit, brought
@@ -88,7 +88,14 @@ def show(request: ShowRequest, progress) -> dict:
         draft, name = edit.draft, request.name
         draft.check(name)
         freed = as_node(edit, name, name, False) if name in draft.inside else {}
-        draft.graph = changed(draft.graph, {name}, lambda node, _: (shown(node, request.showing),))
+        names = {node.name for node, _, _ in draft.graph.walk()}
+
+        def shown_as(node: Node, parent: np.ndarray) -> tuple[Node, ...]:
+            if "crop" in request.showing:
+                return (cropped_as(node, request.showing["crop"], names),)
+            return (shown(node, request.showing),)
+
+        draft.graph = changed(draft.graph, {name}, shown_as)
         return edit.done(request.event, [name], chosen(draft.graph, {name}), **freed)
 
 

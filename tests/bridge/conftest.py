@@ -28,7 +28,7 @@ from fusedrf_cli.engine.distillation.finetune import FinetuneConfig
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds.allocation import AllocationConfig
-from fusedrf_cli.engine.kinds.builder import DistilConfig
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig
 from fusedrf_cli.engine.kinds.resampled import ResampledBuilder
 from fusedrf_cli.engine.kinds.sparse.builder import SparseBuilder
 from fusedrf_cli.engine.kinds.vm.builder import VMBuilderConfig

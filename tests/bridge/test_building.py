@@ -23,10 +23,10 @@ from fusedrf_cli.engine.kinds.builder import (
     BuildRequest,
     Candidate,
     DirectBuilder,
-    DistilConfig,
     DistilledBuilder,
     StorageSetting,
 )
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig
 from fusedrf_cli.engine.kinds.sparse import KIND as SPARSE
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.field import VMField

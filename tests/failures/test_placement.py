@@ -17,7 +17,7 @@ from fusedrf_cli.engine.composition.composite import as_composite
 from fusedrf_cli.engine.composition.resolution_report import opacity_off
 from fusedrf_cli.engine.distillation.distill import distill
 from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.kinds.builder import DistilConfig
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr

@@ -32,7 +32,7 @@ from fusedrf_cli.engine.distillation.teacher import (
 )
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField, sampling_step
 from fusedrf_cli.engine.kernels import working_time
-from fusedrf_cli.engine.kinds.builder import DistilConfig
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig
 from fusedrf_cli.engine.settings import current
 
 
@@ -110,6 +110,8 @@ class DistillRun:
         """What `checkpoint` says between the steps, where other things may take long."""
         self.asked, self.random = False, None
         """Whether the teacher was asked, and the state the generator has to be in then; None: as it is."""
+        self.rays: tuple[int, int] | None = None
+        """Along how many rays it was asked for points, and how many it showed; None: as there is time for."""
 
     def finish(
         self,
@@ -128,11 +130,7 @@ class DistillRun:
         evaluator = self.evaluator or scattered_evaluator(
             self.teacher, config.views, config.view_size, config.seed
         )
-        rays_o, rays_d = self.sampler.draw(config.rays, self.generator)
-        if config.steps:
-            dataset = query_teacher(self.teacher, rays_o, rays_d, self.step, self.generator)
-        else:
-            dataset = render_teacher(self.teacher, rays_o, rays_d)
+        dataset, shown = self._ask()
         held_out = HoldOutRays(self.teacher, self.sampler, self.step, config.seed)
         if self.random is not None:
             self.generator.set_state(self.random)
@@ -148,7 +146,7 @@ class DistillRun:
             clock.lap("points")
         if self.rgb:
             phase("pictures")
-            self._learn(RayPass(dataset, self), config.rgb_steps, held_out, advance, uninterrupted)
+            self._learn(RayPass(shown, self), config.rgb_steps, held_out, advance, uninterrupted)
             report.steps["pictures"] = self.steps
             report.psnr_after_rgb = evaluator(self.student)
             report.rgb_kept = report.psnr_after_rgb > report.psnr_before_rgb
@@ -160,6 +158,34 @@ class DistillRun:
         self.held = None
         report.numeric = self.nan_guard.figures()
         return self.student, report
+
+    def _ask(self) -> tuple[TeacherSamples, TeacherSamples]:
+        """What the teacher says along rays with points on them, and along all rays that pictures are learnt
+        from: along the same as before an interrupt, else along those that there is time for."""
+        config, before, began = self.config, self.rays, working_time()
+        seconds = np.inf if config.time_budget is None else config.asking * config.time_budget
+
+        def enough(asked: int) -> bool:
+            return working_time() - began > seconds
+
+        def enough_points(asked: int) -> bool:
+            return enough(asked) if before is None else asked >= before[0]
+
+        def enough_shown(asked: int) -> bool:
+            return enough(asked) if before is None else asked + len(points.rays_o) >= before[1]
+
+        rays = self.sampler.draw(config.rays, self.generator)
+        if config.steps:
+            points = query_teacher(self.teacher, *rays, self.step, self.generator, enough_points)
+        else:
+            points = render_teacher(self.teacher, *rays, enough_points)
+        shown, more = points, (config.rgb_rays or 0) - len(points.rays_o)
+        if more > 0 and self.rgb:
+            rays = self.sampler.draw(more, self.generator)
+            shown = points.and_rendered(render_teacher(self.teacher, *rays, enough_shown))
+        self.rays = len(points.rays_o), len(shown.rays_o)
+        self.shuffle.count = self.rays[1]
+        return points, shown
 
     def _begin_pictures(self) -> None:
         """What was learnt from points is the RGB phase's start, and what it has to surpass."""
@@ -272,6 +298,7 @@ class DistillRun:
             "adam_steps": self.optimiser.steps,
             "psnr_before_rgb": self.report.psnr_before_rgb,
             "rays": self.count,
+            "asked": self.rays,
             "guard": self.nan_guard.state(),
             "schedule": self.schedule.state(),
             "coarse": self.refined is not None,
@@ -300,6 +327,9 @@ class DistillRun:
         self.nan_guard.restore(state["guard"])
         self.schedule.restore(state["schedule"])
         self.report.curve = [(float(at), int(steps), float(psnr)) for at, steps, psnr in state["curve"]]
+        if state["asked"] is not None:
+            points, shown = map(int, state["asked"])
+            self.rays, self.shuffle.count = (points, shown), shown
         self.shuffle.restore(arrays, state)
         self.random = torch.from_numpy(arrays["random"]) if "random" in arrays else None
         if self.random is not None:

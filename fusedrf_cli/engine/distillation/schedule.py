@@ -1,6 +1,6 @@
 """When a phase of learning slows down, and when it ends."""
 
-from fusedrf_cli.engine.kinds.builder import DistilConfig
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig
 
 
 class Schedule:

@@ -23,7 +23,7 @@ class Shuffle:
         chosen = np.empty(count, np.int64)
         done = 0
         while done < count:
-            if self.keys is None or self.at == self.count:
+            if self.keys is None or self.at >= self.count:
                 self.keys, self.at = self._new_keys(), 0
             part = chosen[done : done + self.count - self.at]
             shuffled(self.at, self.count, self.keys, part)

@@ -2,6 +2,7 @@
 rays.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,8 @@ class TeacherConfig:
     """Optical depth of a step from which a sample counts as density."""
     empty_share: float = 0.15
     """Of the samples with less that are kept: nine in ten are such, and without them floaters stay."""
+    rendered_at_once: int = 1 << 17
+    """Rays, of those that are rendered alone."""
     reckoned_rays: int = 2000
     """Of which the number of points is reckoned."""
 
@@ -76,6 +79,15 @@ class TeacherPoints:
         return TeacherPoints(*(torch.cat([column[start:], column[:over]]) for column in self.columns()))
 
 
+Enough = Callable[[int], bool]
+"""Whether so many rays of a teacher do."""
+
+
+def all_rays(asked: int) -> bool:
+    """That no rays are enough but all."""
+    return False
+
+
 @dataclass
 class TeacherSamples:
     """Rays of a teacher and the points on them, in the teacher's frame."""
@@ -87,6 +99,13 @@ class TeacherSamples:
     """(R, 4) float32: rgb premultiplied by opacity, opacity."""
     points: TeacherPoints
 
+    def and_rendered(self, more: "TeacherSamples") -> "TeacherSamples":
+        """With the rays of others, whose points are left out."""
+        rays_o, rays_d = (
+            np.concatenate(two) for two in ((self.rays_o, more.rays_o), (self.rays_d, more.rays_d))
+        )
+        return TeacherSamples(rays_o, rays_d, torch.cat([self.pixels, more.pixels]), self.points)
+
 
 def query_teacher(
     teacher: RadianceField,
@@ -94,26 +113,34 @@ def query_teacher(
     rays_d: np.ndarray,
     step: float,
     generator: torch.Generator,
+    enough: Enough = all_rays,
 ) -> TeacherSamples:
     """Render rays (R, 3) through a teacher and keep some samples in front of what is opaque as points, in
-    random order.
+    random order; of the rays only the first ones, where these are enough.
     """
-    parts, at_once = [], current(RenderConfig).rays_at_once
-    for start in range(0, len(rays_o), at_once):
-        part = slice(start, start + at_once)
+    parts, asked, at_once = [], 0, current(RenderConfig).rays_at_once
+    while not asked or asked < len(rays_o) and not enough(asked):
+        part = slice(asked, asked + at_once)
         parts.append(_ask_part(teacher, rays_o[part], rays_d[part], step, generator))
+        asked += at_once
     pixels, *columns = (list(column) for column in zip(*parts, strict=True))
     parts.clear()
     order = torch.randperm(sum(map(len, columns[0])), generator=generator, dtype=torch.int32)
     points = TeacherPoints(*(_shuffled(column, order) for column in columns))
-    return TeacherSamples(rays_o, rays_d, torch.cat(pixels), points)
+    return TeacherSamples(rays_o[:asked], rays_d[:asked], torch.cat(pixels), points)
 
 
-def render_teacher(teacher: RadianceField, rays_o: np.ndarray, rays_d: np.ndarray) -> TeacherSamples:
-    """Rays (R, 3) through a teacher without any points, for a student that learns from rays alone."""
-    pixels = torch.from_numpy(render_rays(teacher, rays_o, rays_d)[:, :4])
+def render_teacher(
+    teacher: RadianceField, rays_o: np.ndarray, rays_d: np.ndarray, enough: Enough = all_rays
+) -> TeacherSamples:
+    """Rays (R, 3) through a teacher without any points, as `query_teacher` has them."""
+    parts, asked, at_once = [], 0, current(TeacherConfig).rendered_at_once
+    while not asked or asked < len(rays_o) and not enough(asked):
+        part = slice(asked, asked + at_once)
+        parts.append(torch.from_numpy(render_rays(teacher, rays_o[part], rays_d[part])[:, :4]))
+        asked += at_once
     none = torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), torch.zeros(0)
-    return TeacherSamples(rays_o, rays_d, pixels, TeacherPoints(*none))
+    return TeacherSamples(rays_o[:asked], rays_d[:asked], torch.cat(parts), TeacherPoints(*none))
 
 
 def _shuffled(pieces: list[torch.Tensor], order: torch.Tensor) -> torch.Tensor:

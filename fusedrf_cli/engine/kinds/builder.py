@@ -16,6 +16,7 @@ from fusedrf_cli.engine.composition.resolution_report import ResolutionReport
 from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import texels
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig, mostly_pictures
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.settings import current
 
@@ -41,6 +42,8 @@ class BuilderConfig:
     """Four objects after 5, 15, 45 s: best with 6, 12, 25 of 3, 6, 12, 25 million."""
     rays_per_second: int = 40_000
     """That are asked for each second of learning."""
+    most_rays: int = 4_800_000
+    """That pictures are learnt from."""
     most_told: float = 2.0
     """Four objects in 24 million: 36.4 dB by one lesson, 36.9 by twice the steps, 38.1 by all."""
     patient: float = 150.0
@@ -115,52 +118,6 @@ class StoredSizes(Protocol):
     def per_number(self, precision: str) -> float:
         """About so many bytes for a number."""
         ...
-
-
-@dataclass(frozen=True)
-class DistilConfig:
-    """How a student learns from a teacher: from points on rays, then from the pictures that the rays make."""
-
-    rays: int = 800_000
-    """That the teacher is asked for."""
-    steps: int = 800
-    """From the points on those rays; 0 where the student knows already what they would teach it."""
-    points_per_step: int = 1 << 15
-    rate: float = 0.08
-    """Of points: four times what pictures are learnt at, since points say at once where all is."""
-    coarse_from: int | None = 64
-    """Texels along a student's longest axis from which it starts at half of them; None: never."""
-    coarse_until: float = 0.3
-    """Share of the points' phase in which it is coarse: a step is cheaper then and reaches farther."""
-    rgb_steps: int = 600
-    """From the pictures that the rays make."""
-    rgb_samples: int = 1 << 15
-    """Samples per step that the number of rays is steered to."""
-    rgb_rate: float = 0.003
-    rays_at_first: int = 1024
-    """Of a step."""
-    opacity_weight: float = 0.1
-    """Against the colour."""
-    early_stop: float = 1e-3
-    """Transmittance at which a ray ends."""
-    time_budget: float | None = None
-    """Seconds of learning. None: the steps decide, and equal seeds give equal bytes."""
-    points_part: float = 0.75
-    """Of that, where both phases have steps."""
-    cooling: float = 0.4
-    """Of a phase that is not cut short: the share at its end in which the rate falls."""
-    rate_decay: float = 0.1
-    """The last step's rate over the first's."""
-    look_every: int = 100
-    """Steps between two looks at what nothing is trained on."""
-    patience: int = 3
-    """Looks that the best one may be old."""
-    least_gain: float = 0.1
-    """dB above the best so far that make a look a better one."""
-    seed: int = 0
-    views: int = 4
-    view_size: int = 160
-    """Pixels a side of the views it is judged on."""
 
 
 @dataclass(frozen=True)
@@ -296,7 +253,8 @@ class DistilledBuilder:
     @property
     def distil_config(self) -> DistilConfig | None:
         """How it learns; None: from rays drawn once for all tries (distillation/finetune.py)."""
-        return current(DistilConfig)
+        lesson = current(DistilConfig)
+        return mostly_pictures(lesson) if self.kind.taught_by_pictures else lesson
 
     def distil_config_for(self, numbers: int, seconds: float | None = None) -> DistilConfig | None:
         """How a student of so many numbers learns, in so many seconds where they are given: the more numbers
@@ -315,10 +273,11 @@ class DistilledBuilder:
         more = min(max(1.0, numbers / config.told_numbers), config.most_told)
         if seconds is not None:
             more *= min(max(1.0, seconds / config.patient), config.most_patient)
-        rays, steps = round(more * lesson.rays), round(more * lesson.steps)
+        rays, steps, shown = round(more * lesson.rays), round(more * lesson.steps), lesson.rgb_rays
         if seconds is not None:
-            rays = min(rays, int(config.rays_per_second * seconds) + 1)
-        return replace(lesson, rays=rays, steps=steps, time_budget=seconds)
+            known = int(config.rays_per_second * seconds) + 1
+            rays, shown = min(rays, known), min(known, config.most_rays)
+        return replace(lesson, rays=rays, rgb_rays=shown, steps=steps, time_budget=seconds)
 
     def unchanged(self) -> "Candidate | None":
         """The scene itself, where nothing of it is to be changed; None where a student stands for it."""

@@ -49,6 +49,8 @@ class Kind:
     """Which of StorageSetting's words it heeds, besides the precision: "ranks", "sh_degree"."""
     reduces: frozenset[str] = frozenset()
     """Which of them `reduction` heeds."""
+    taught_by_pictures = False
+    """Whether a student of it learns more from a teacher's pictures than from its points."""
     on_vertices = False
     """Whether its fields have numbers for each vertex of a grid: as fine as others they take more bytes."""
     hashes = False

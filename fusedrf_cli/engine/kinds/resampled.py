@@ -18,12 +18,12 @@ from fusedrf_cli.engine.kinds.box_kind import GridBuilder
 from fusedrf_cli.engine.kinds.builder import (
     Candidate,
     DirectBuilder,
-    DistilConfig,
     MemoryEstimate,
     Plan,
     StorageSetting,
     TooSmall,
 )
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig
 from fusedrf_cli.engine.kinds.field_sampling import (
     FieldSamplingConfig,
     colours,

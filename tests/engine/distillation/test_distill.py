@@ -17,10 +17,13 @@ from fusedrf_cli.engine.distillation.distill import DistillRun, distill
 from fusedrf_cli.engine.distillation.evaluation import scattered_evaluator
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.student import pruned
+from fusedrf_cli.engine.distillation.teacher import TeacherConfig
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, texels
-from fusedrf_cli.engine.kinds.builder import DistilConfig, finest_within
+from fusedrf_cli.engine.kinds.builder import finest_within
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.field import VMField
+from fusedrf_cli.engine.rendering.volume import RenderConfig
 from tests.analytic.export import way_of
 from tests.analytic.rays import affine, turn
 from tests.engine.conftest import BOX, THIRTY_TWO, Ball, points_in, random_vm, unit
@@ -216,6 +219,23 @@ def test_the_coarse_student_learns_too(monkeypatch):
 def a_run(settings: DistilConfig) -> module.DistillRun:
     student = VM.empty(TEACHER, WAY, NUMBERS, torch.Generator().manual_seed(settings.seed), "ball")
     return module.DistillRun(TEACHER, student, SAMPLER, settings)
+
+
+def test_pictures_are_learnt_from_more_rays_than_points(in_force):
+    """As many as there is time for, but for the first ones, and after an interrupt as many as before."""
+    in_force(RenderConfig(rays_at_once=500), TeacherConfig(rendered_at_once=500))
+    brief = replace(SETTINGS, rays=2000, rgb_rays=5000, steps=4, rgb_steps=3)
+    run = a_run(brief)
+    run.finish()
+    assert run.rays == (2000, 5000) and run.shuffle.count == 5000
+    hurried = a_run(replace(brief, time_budget=0.2, asking=0.0))
+    hurried.finish()
+    assert hurried.rays == (500, 1000)
+    arrays, state = hurried.checkpoint()
+    again = a_run(replace(brief, time_budget=30.0))
+    again.restore(arrays, state)
+    points, shown = again._ask()
+    assert (len(points.rays_o), len(shown.rays_o)) == again.rays == (500, 1000)
 
 
 def test_without_rgb_nothing_is_said_of_it():

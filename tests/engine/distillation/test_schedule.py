@@ -5,7 +5,7 @@ import json
 import pytest
 
 from fusedrf_cli.engine.distillation.schedule import Schedule
-from fusedrf_cli.engine.kinds.builder import DistilConfig
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig
 
 CONFIG = DistilConfig()
 

@@ -1,11 +1,14 @@
 """What is asked of a teacher: pixels as the renderer has them, and points."""
 
+from functools import partial
+from operator import le
+
 import numpy as np
 import pytest
 import torch
 
 from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.distillation.teacher import TeacherConfig, query_teacher
+from fusedrf_cli.engine.distillation.teacher import TeacherConfig, query_teacher, render_teacher
 from fusedrf_cli.engine.rendering.volume import RenderConfig, render_rays
 from tests.engine.conftest import BOX, Gaussian, Slab
 
@@ -87,3 +90,21 @@ def test_rays_past_everything_give_no_points():
     rays_o, rays_d = np.array([[-3.0, 0, 5]]), np.array([[1.0, 0, 0]])
     dataset = query_teacher(Slab(), rays_o, rays_d, 0.02, seeded())
     assert len(dataset.points) == 0 and not dataset.pixels.any()
+
+
+def test_the_first_rays_are_asked_where_these_are_enough(in_force):
+    """In whole parts, at least one; each as if all had been asked."""
+    in_force(RenderConfig(rays_at_once=40), TeacherConfig(rendered_at_once=40))
+    field, rays = Gaussian(density=8.0), RaySampler([BOX]).draw(150, seeded())
+    whole, shown = query_teacher(field, *rays, 0.05, seeded(3)), render_teacher(field, *rays)
+    assert len(whole.rays_o) == len(shown.pixels) == 150
+    for wanted, asked in ((0, 40), (40, 40), (41, 80), (500, 150)):
+        some = query_teacher(field, *rays, 0.05, seeded(3), partial(le, wanted))
+        assert torch.equal(some.pixels, whole.pixels[:asked])
+        np.testing.assert_array_equal(some.rays_d, rays[1][:asked])
+        seen = render_teacher(field, *rays, partial(le, wanted))
+        assert torch.equal(seen.pixels, shown.pixels[:asked]) and len(seen.points) == 0
+        np.testing.assert_array_equal(seen.rays_o, rays[0][:asked])
+    both = whole.and_rendered(seen)
+    assert both.points is whole.points and torch.equal(both.pixels, torch.cat([whole.pixels, seen.pixels]))
+    np.testing.assert_array_equal(both.rays_d, np.concatenate([rays[1]] * 2))

@@ -23,6 +23,7 @@ class HashKind(BoxKind):
     name = "hash"
     good_for = "Surroundings and objects of fine detail, as Instant-NGP holds them."
     field = HashField
+    taught_by_pictures = True
 
     def shape_at(self, storage: StorageSetting, resolution: tuple[int, int, int]) -> object:
         """See BoxKind: levels up to FINER vertices on a texel, of at most four times the rows that a plane of

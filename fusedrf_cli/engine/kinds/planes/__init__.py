@@ -10,6 +10,7 @@ class PlanesKind(BoxKind):
     name = "planes"
     good_for = "Products of planes, as K-Planes holds what stands still; vm shows more in as many bytes."
     field = PlanesField
+    taught_by_pictures = True
     distilled = "int8"  # decision 053: half the features in twice the numbers show no less
 
 

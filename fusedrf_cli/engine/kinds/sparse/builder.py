@@ -20,12 +20,12 @@ from fusedrf_cli.engine.kinds.builder import (
     Candidate,
     Contents,
     DirectBuilder,
-    DistilConfig,
     MemoryEstimate,
     Plan,
     Section,
     StorageSetting,
 )
+from fusedrf_cli.engine.kinds.distil_config import DistilConfig
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.reduction import Reduction
 from fusedrf_cli.engine.kinds.sparse import coarsening
