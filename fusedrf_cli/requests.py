@@ -59,7 +59,7 @@ class Input(Placing):
 
     @property
     def node_name(self) -> str:
-        return self.name or Path(self.path).stem
+        return self.name or Path(self.path).stem or Path(self.path).resolve().stem or "source"
 
 
 @dataclass(frozen=True)
