@@ -169,6 +169,7 @@ def test_a_phase_without_steps_takes_no_time_from_the_other(steps, part):
     student = VM.empty(SCENE, way_of(SHAPE), most, torch.Generator().manual_seed(0), "")
     settings = TinySettings(steps=steps, rgb_steps=10, time_budget=8.0)
     run = DistillRun(SCENE, student, SAMPLER, settings)
+    run.phase = "points" if steps else "pictures"
     assert run._share(10, 8.0 * part) == pytest.approx(1.0)
     assert run._share(10, 2.0) == pytest.approx(2.0 / (8.0 * part))
 

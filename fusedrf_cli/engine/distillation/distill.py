@@ -99,6 +99,8 @@ class DistillRun:
         itself = weakref.ref(self)  # a circle of references would keep hundreds of megabytes for longer
         self.nan_guard = NanGuard(lambda: itself().optimiser.numbers())
         self.phase, self.steps, self.elapsed = "points", 0, 0.0
+        self.points_seconds = 0.0
+        """That points took, once they are done."""
         self.learnt_seconds = 0.0
         """That this process has learnt for."""
         self.schedule = Schedule(config)
@@ -198,7 +200,7 @@ class DistillRun:
             self.optimiser = Adam.of(self.student)
             self.nan_guard.renew()
         self.report.steps["points"] = self.steps
-        self.phase, self.steps, self.elapsed = "pictures", 0, 0.0
+        self.phase, self.steps, self.points_seconds, self.elapsed = "pictures", 0, self.elapsed, 0.0
         self.schedule = Schedule(self.config)
 
     def _refine(self) -> None:
@@ -269,17 +271,19 @@ class DistillRun:
 
     def _share(self, steps: int, seconds: float) -> float:
         """The share of the phase that is done: of its steps, or of its seconds where a budget is given, of
-        which points have a part where pictures follow."""
+        which points have a part at most where pictures follow."""
         if not steps:
             return self.schedule.end
         config = self.config
         if config.time_budget is None:
             return self.steps / steps
-        if config.time_budget <= 0:
-            return self.schedule.end
-        part = config.points_part if self.phase == "points" else 1 - config.points_part
-        alone = not config.steps or not (self.rgb and config.rgb_steps)
-        return seconds / (config.time_budget * (1.0 if alone else part))
+        whole, then = config.time_budget, self.rgb and config.rgb_steps
+        if self.phase == "points":
+            of_steps = self.steps / steps if then and config.enough_steps else 0.0
+            whole *= config.points_part if then else 1.0
+        else:
+            of_steps, whole = 0.0, whole - self.points_seconds
+        return max(of_steps, seconds / whole) if whole > 0 else self.schedule.end
 
     def checkpoint(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and JSON-able state from which `restore` goes on as if nothing had happened."""
@@ -295,10 +299,12 @@ class DistillRun:
             "phase": self.phase,
             "steps": self.steps,
             "elapsed": self.elapsed,
+            "points_seconds": self.points_seconds,
             "adam_steps": self.optimiser.steps,
             "psnr_before_rgb": self.report.psnr_before_rgb,
             "rays": self.count,
-            "asked": self.rays,
+            "asked": self.rays and self.rays[0],
+            "shown": self.rays and self.rays[1],
             "guard": self.nan_guard.state(),
             "schedule": self.schedule.state(),
             "coarse": self.refined is not None,
@@ -324,12 +330,13 @@ class DistillRun:
         self.optimiser.restore(arrays, state["adam_steps"])
         self.count = state["rays"]
         self.phase, self.steps, self.elapsed = state["phase"], state["steps"], max(state["elapsed"], 0)
+        self.points_seconds = max(state["points_seconds"], 0)
         self.nan_guard.restore(state["guard"])
         self.schedule.restore(state["schedule"])
         self.report.curve = [(float(at), int(steps), float(psnr)) for at, steps, psnr in state["curve"]]
         if state["asked"] is not None:
-            points, shown = map(int, state["asked"])
-            self.rays, self.shuffle.count = (points, shown), shown
+            self.rays = int(state["asked"]), int(state["shown"])
+            self.shuffle.count = self.rays[1]
         self.shuffle.restore(arrays, state)
         self.random = torch.from_numpy(arrays["random"]) if "random" in arrays else None
         if self.random is not None:

@@ -39,7 +39,9 @@ class DistilConfig:
     asking: float = 1.0
     """Times as many seconds at most for what the teacher is asked before, but for the first rays."""
     points_part: float = 0.75
-    """Of that, where both phases have steps."""
+    """Of that at most, where both phases have steps; pictures have the rest."""
+    enough_steps: bool = False
+    """Whether points end after their steps, whatever time there is."""
     cooling: float = 0.4
     """Of a phase that is not cut short: the share at its end in which the rate falls."""
     rate_decay: float = 0.1
@@ -61,11 +63,10 @@ class PicturesConfig:
     """How a student learns otherwise that learns mostly from pictures (`Kind.taught_by_pictures`): points say
     where all is, but meet few of a fine level's numbers."""
 
-    points: float = 0.5
-    """Times the rays with points, and the steps from these, ..."""
+    points: float = 0.75
+    """Times the rays with points, and the steps from these, after which pictures have all the time, ..."""
     pictures: float = 3.0
     """... and the rays and steps of pictures."""
-    points_part: float = 0.2
     rgb_rate: float = 0.02
     """That of photos."""
 
@@ -77,7 +78,7 @@ def mostly_pictures(lesson: DistilConfig) -> DistilConfig:
         lesson,
         rays=round(own.points * lesson.rays),
         steps=round(own.points * lesson.steps),
-        points_part=own.points_part,
+        enough_steps=True,
         rgb_rays=round(own.pictures * lesson.rays),
         rgb_steps=round(own.pictures * lesson.rgb_steps),
         rgb_rate=own.rgb_rate,

@@ -16,6 +16,7 @@ from fusedrf_cli.engine.distillation import distill as module
 from fusedrf_cli.engine.distillation.distill import DistillRun, distill
 from fusedrf_cli.engine.distillation.evaluation import scattered_evaluator
 from fusedrf_cli.engine.distillation.sampler import RaySampler
+from fusedrf_cli.engine.distillation.schedule import Schedule
 from fusedrf_cli.engine.distillation.student import pruned
 from fusedrf_cli.engine.distillation.teacher import TeacherConfig
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, texels
@@ -288,11 +289,23 @@ def test_pruned_drops_empty_cells_only():
     assert not pruned(random_vm(THIRTY_TWO, dtype=torch.float32, cells=8, scale=1e-6)).occupied.any()
 
 
-def test_points_have_three_quarters_of_the_seconds_and_all_where_nothing_else_is_learnt():
-    def share(phase: str, rgb: bool = True, **words) -> float:
+def test_points_have_three_quarters_of_the_seconds_at_most_and_pictures_the_rest():
+    """Points have all where nothing else is learnt."""
+
+    def share(phase: str, rgb: bool = True, points_seconds: float = 6.0, **words) -> float:
         config = DistilConfig(time_budget=8.0, **words)
-        run = SimpleNamespace(config=config, rgb=rgb, phase=phase)
+        schedule = Schedule(config)
+        run = SimpleNamespace(
+            config=config, rgb=rgb, phase=phase, steps=200, points_seconds=points_seconds, schedule=schedule
+        )
         return DistillRun._share(run, config.steps if phase == "points" else config.rgb_steps, 3.0)
 
     assert share("points") == pytest.approx(3 / 6) and share("pictures") == pytest.approx(3 / 2)
-    assert share("points", rgb=False) == share("pictures", steps=0) == pytest.approx(3 / 8)
+    assert share("points", rgb=False) == pytest.approx(3 / 8)
+    assert share("pictures", steps=0, points_seconds=0.0) == pytest.approx(3 / 8)
+    assert share("pictures", points_seconds=2.0) == pytest.approx(3 / 6)
+    assert share("pictures", points_seconds=9.0) == Schedule(DistilConfig()).end
+    assert share("points", steps=250) == pytest.approx(3 / 6)
+    assert share("points", steps=250, enough_steps=True) == pytest.approx(200 / 250)
+    assert share("points", steps=800, enough_steps=True) == pytest.approx(3 / 6)
+    assert share("points", rgb=False, steps=250, enough_steps=True) == pytest.approx(3 / 8)
