@@ -49,7 +49,9 @@ class DistilConfig:
     look_every: int = 100
     """Steps between two looks at what nothing is trained on."""
     patience: int = 3
-    """Looks that the best one may be old."""
+    """Looks that the best one may be old, ..."""
+    patient_share: float = 0.2
+    """... and the share of the phase that it may be: at a rate that does not fall what is held out sways."""
     least_gain: float = 0.1
     """dB above the best so far that make a look a better one."""
     seed: int = 0
@@ -63,7 +65,7 @@ class PicturesConfig:
     """How a student learns otherwise that learns mostly from pictures (`Kind.taught_by_pictures`): points say
     where all is, but meet few of a fine level's numbers."""
 
-    points: float = 0.75
+    points: float = 1.0
     """Times the rays with points, and the steps from these, after which pictures have all the time, ..."""
     pictures: float = 3.0
     """... and the rays and steps of pictures."""

@@ -26,6 +26,7 @@ def test_a_plateau_ends_it_sooner():
     """The fall begins with the look that shows it, and is then `cooling` of what is done in all."""
     schedule = Schedule(CONFIG)
     schedule.observe(0.1, 30.0)
+    assert 0.1 * CONFIG.patience >= CONFIG.patient_share
     for i in range(CONFIG.patience):
         assert schedule.end == pytest.approx(1)
         schedule.observe(0.2 + 0.1 * i, 30.0 + 0.9 * CONFIG.least_gain)
@@ -47,6 +48,15 @@ def test_a_better_look_starts_the_count_anew():
 
 
 @pytest.mark.parametrize("looks", [0, 1, 5])
+def test_many_looks_in_little_time_end_nothing():
+    schedule = Schedule(CONFIG)
+    for i in range(20):
+        schedule.observe(0.1 + 0.009 * i, 30.0)
+    assert schedule.end == pytest.approx(1)
+    schedule.observe(0.1 + CONFIG.patient_share, 30.0)
+    assert schedule.cooling_from == pytest.approx(0.1 + CONFIG.patient_share)
+
+
 def test_a_restored_schedule_goes_on_as_it_would_have(looks):
     schedule, again = Schedule(CONFIG), Schedule(CONFIG)
     for i in range(looks):
