@@ -8,8 +8,8 @@ class Schedule:
 
     Time is the share of the phase that is done, of its steps or of its seconds. The fall begins `cooling`
     before the end, or as soon as `patience` looks and `patient_share` of the phase have brought no more than
-    `least_gain`, and then takes as much less time as it begins earlier: it is `cooling` of all that was done in
-    either case.
+    `least_gain`, and then takes as much less time as it begins earlier: it is `cooling` of all that was done
+    in either case.
     """
 
     def __init__(self, config: DistilConfig):

@@ -47,7 +47,6 @@ def test_a_better_look_starts_the_count_anew():
     assert schedule.end == pytest.approx(1)
 
 
-@pytest.mark.parametrize("looks", [0, 1, 5])
 def test_many_looks_in_little_time_end_nothing():
     schedule = Schedule(CONFIG)
     for i in range(20):
@@ -57,6 +56,7 @@ def test_many_looks_in_little_time_end_nothing():
     assert schedule.cooling_from == pytest.approx(0.1 + CONFIG.patient_share)
 
 
+@pytest.mark.parametrize("looks", [0, 1, 5])
 def test_a_restored_schedule_goes_on_as_it_would_have(looks):
     schedule, again = Schedule(CONFIG), Schedule(CONFIG)
     for i in range(looks):
