@@ -17,11 +17,14 @@ from fusedrf_cli.requests import ConvertRequest, EvaluateRequest, FuseRequest
 
 @dataclass(frozen=True)
 class ConvertingConfig:
-    """How large a field on vertices gets where no size is asked for: as fine as one that is trained. With
-    what a fuse allows, a chair of 256 texels would have 194."""
+    """How large a field gets where no size is asked for. One on vertices is as fine as one that is trained:
+    with what a fuse allows, a chair of 256 texels would have 194."""
 
     max_size: int = 50_000_000
-    """Bytes, beside what the places among the sources take."""
+    """Bytes of one on vertices, beside what the places among the sources take."""
+    components: int = 2
+    """Times those of a trained field, of kinds that have them: what another kind shows is not of as few
+    (decision 054)."""
     most_held: int = 150_000_000
     """Numbers in memory: with what learning adds, some 4 GB."""
 
@@ -39,6 +42,9 @@ def convert(request: ConvertRequest, progress) -> dict:
     same = [field.name for field in fields(FuseRequest) if hasattr(request, field.name)]
     words = {name: getattr(request, name) for name in same}
     config = current(ConvertingConfig)
+    if target_kind.usual_ranks and request.ranks is None and request.max_size is None:
+        density, colour = target_kind.usual_ranks
+        words["ranks"] = config.components * density, config.components * colour
     larger = using(
         replace(current(FusingConfig), default_max_size=config.max_size),
         replace(current(BoxKindConfig), most_held=config.most_held),

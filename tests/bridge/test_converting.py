@@ -14,3 +14,14 @@ def test_vertices_may_take_what_those_of_a_trained_field_do(report, folder, word
     with ZipFile(folder / "out.rfpack") as bundle:
         (entry,) = json.loads(bundle.read("scene.json"))["history"]
     assert entry["settings"]["max_size"] == most * 1_000_000
+
+
+@pytest.mark.parametrize(
+    "words, ranks", [((), [32, 48]), (("--max-size", "1MB"), None), (("--ranks", "8,16"), [8, 16])]
+)
+def test_one_of_components_has_twice_those_of_a_trained_field(report, folder, words, ranks):
+    """But where a size is asked for, or others are."""
+    report("convert", "red.rfpack", "--kind", "vm", "--time-budget", "0.5", "-o", "out.rfpack", *words)
+    with ZipFile(folder / "out.rfpack") as bundle:
+        (entry,) = json.loads(bundle.read("scene.json"))["history"]
+    assert entry["settings"]["ranks"] == ranks

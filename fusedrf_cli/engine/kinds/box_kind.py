@@ -54,6 +54,11 @@ class BoxKind(Kind):
         """The field's shape where nothing is asked."""
         return self.field.shape_type()
 
+    @property
+    def usual_ranks(self) -> tuple[int, int] | None:
+        """See Kind."""
+        return (self.usual.density_rank, self.usual.colour_rank) if "ranks" in self.takes else None
+
     def shape(self, storage: StorageSetting) -> object:
         """The field's shape for a way; what the way leaves open is as usual."""
         options = {"sh_degree": storage.sh_degree}

@@ -47,6 +47,8 @@ class Kind:
     """What it learns from photos at, relative to `TrainConfig.rate`."""
     takes: frozenset[str] = frozenset()
     """Which of StorageSetting's words it heeds, besides the precision: "ranks", "sh_degree"."""
+    usual_ranks: tuple[int, int] | None = None
+    """Density and colour components of a trained field; None: it has none that can be chosen."""
     reduces: frozenset[str] = frozenset()
     """Which of them `reduction` heeds."""
     taught_by_pictures = False
