@@ -189,11 +189,6 @@ def best_of(
     """The best stand of a kind for a scene; overhead: bytes of the bundle besides its fields. UsageProblem
     where nothing fits the size that is allowed."""
     builder_request = build_request(request, scene, overhead)
-    if (limit := builder_request.limit) <= overhead:
-        raise UsageProblem(
-            f"--max-size is too small: it allows {readable_size(limit)}, and the scene graph alone takes "
-            f"{readable_size(overhead)}; give more, such as 10MB"
-        )
     background = background_for(kind, scene.composed, builder_request)
     composed = scene.composed
     if background is not None:

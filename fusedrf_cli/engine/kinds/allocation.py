@@ -121,15 +121,22 @@ class FieldShares:
             fitting += fits[first : first + 1]
         return min(fitting, key=self.error, default=None)
 
-    def smallest(self) -> int:
-        """Bytes of the least share."""
+    @property
+    def least(self) -> Share:
+        """That of the fewest bytes."""
         config = current(AllocationConfig)
         ranks = config.ranks[-1] if self.ranked and config.ranks else None
-        return min(self.bytes(Share(p, config.most_steps, ranks)) for p in self.ladder)
+        return min((Share(p, config.most_steps, ranks) for p in self.ladder), key=self.bytes)
+
+    def smallest(self) -> int:
+        """Bytes of the least share."""
+        return self.bytes(self.least)
 
 
 def allocated(fields: Sequence[FieldShares], limit: int) -> list[Share]:
-    """The shares with which the fields take no more than so many bytes, where any do."""
+    """The shares with which the fields take no more than so many bytes, where any do, else the least."""
+    if sum(field.smallest() for field in fields) > limit:  # no error needs to be measured for that
+        return [field.least for field in fields]
     shares = [field.whole for field in fields]
     sizes = [field.bytes(share) for field, share in zip(fields, shares, strict=True)]
 

@@ -36,12 +36,12 @@ class DistilConfig:
     """Transmittance at which a ray ends."""
     time_budget: float | None = None
     """Seconds of learning. None: the steps decide, and equal seeds give equal bytes."""
-    asking: float = 1.0
-    """Times as many seconds at most for what the teacher is asked before, but for the first rays."""
     points_part: float = 0.75
     """Of that at most, where both phases have steps; pictures have the rest."""
     enough_steps: bool = False
     """Whether points end after their steps, whatever time there is."""
+    asking: float = 1.0
+    """Seconds, for each of learning, after which the teacher is asked no more; a first part it always is."""
     cooling: float = 0.4
     """Of a phase that is not cut short: the share at its end in which the rate falls."""
     rate_decay: float = 0.1
@@ -65,21 +65,17 @@ class PicturesConfig:
     """How a student learns otherwise that learns mostly from pictures (`Kind.taught_by_pictures`): points say
     where all is, but meet few of a fine level's numbers."""
 
-    points: float = 1.0
-    """Times the rays with points, and the steps from these, after which pictures have all the time, ..."""
     pictures: float = 3.0
-    """... and the rays and steps of pictures."""
+    """Times as many rays as there are with points, and times as many steps from them."""
     rgb_rate: float = 0.02
     """That of photos."""
 
 
 def mostly_pictures(lesson: DistilConfig) -> DistilConfig:
-    """A lesson with fewer points and more pictures."""
+    """A lesson with more pictures, which have all the time after the steps from points."""
     own = current(PicturesConfig)
     return replace(
         lesson,
-        rays=round(own.points * lesson.rays),
-        steps=round(own.points * lesson.steps),
         enough_steps=True,
         rgb_rays=round(own.pictures * lesson.rays),
         rgb_steps=round(own.pictures * lesson.rgb_steps),
