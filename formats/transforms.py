@@ -24,7 +24,7 @@ from formats.images import Header
 from formats.matching import find_file, stem_key
 from formats.photos import Folder, natural
 from formats.points import MAX_POINTS, SparsePoints, points_notes, read_ply_points
-from formats.views import View
+from formats.views import Capture, View
 
 BLENDER_FILE = re.compile(r"transforms_(train|val|test)\.json")
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
@@ -252,7 +252,10 @@ def _placed(
     file holds points before or after the transform."""
     if points is None or not len(points.positions) or not views:
         return None
-    candidates = [points, *(points.moved(matrix) for matrix in _applied(path, document))]
+    candidates = [points]
+    if "applied_transform" in document:
+        applied = _applied(path, document)
+        candidates.append(points.moved(applied.matrix * applied.scale))
     some = views[:: max(1, len(views) // 20)]
 
     def share(moved: SparsePoints) -> float:
@@ -273,18 +276,37 @@ def _agrees(points: SparsePoints, seen: Mapping[str, np.ndarray], views: tuple[V
     return bool(shown) and np.concatenate(shown).mean() > AGREEING
 
 
-def _applied(path: Path, document: dict) -> list[np.ndarray]:
-    """The (3, 4) transform and scale that took COLMAP's world to the poses', where the file has them."""
-    if "applied_transform" not in document:
-        return []
+@dataclass(frozen=True, eq=False)
+class Applied:
+    """What nerfstudio did to the poses of a capture before it wrote them."""
+
+    matrix: np.ndarray
+    """(3, 4) applied to the world in which they were estimated, ..."""
+    scale: float
+    """... and then their scale."""
+
+
+def applied_to(capture: Capture) -> Applied | None:
+    """What was done to the poses of a capture before its file had them, by what that says; None where it says
+    nothing. Raises BadSchema."""
+    if capture.kind != "transforms":
+        return None
+    document = read_document(capture.path)
+    return (
+        _applied(capture.path, document) if {"applied_transform", "applied_scale"} & set(document) else None
+    )
+
+
+def _applied(path: Path, document: dict) -> Applied:
+    """What a file says was done to its poses."""
     try:
-        matrix = np.array(document["applied_transform"], np.float64).reshape(-1, 4)[:3]
+        matrix = np.array(document.get("applied_transform", np.eye(4)), np.float64).reshape(-1, 4)[:3]
         scale = float(document.get("applied_scale", 1.0))
     except (TypeError, ValueError, OverflowError):
         matrix, scale = np.empty(0), 1.0
     if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or not 0 < scale < 1e12:
         raise BadSchema(f"{path}: expected applied_transform to be a 3x4 matrix, and applied_scale positive")
-    return [matrix * scale]
+    return Applied(matrix, scale)
 
 
 def _sample(points: SparsePoints) -> np.ndarray:

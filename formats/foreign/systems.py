@@ -37,6 +37,8 @@ MAX_FILES = 2000
 MAX_TRIED = 50
 MAX_NAMES = 50_000
 """Names of a checkpoint that its system is told by."""
+WRAPPERS = "module.", "_orig_mod."
+"""In front of the names of a wrapped model's numbers."""
 CAPTURED = (
     "active_sh_degree", "_xyz", "_features_dc", "_features_rest", "_scaling", "_rotation", "_opacity",
     "max_radii2D", "xyz_gradient_accum", "denom", "optimizer", "spatial_lr_scale",
@@ -145,10 +147,24 @@ def _table(value: object) -> dict:
     """A torch file's dictionary; what 3DGS saves, by its names; anything else under that of its type."""
     match value:
         case dict():
-            return value
+            return _unwrapped(value)
         case ((*model,), int() as step) if len(model) == len(CAPTURED) and isinstance(model[1], StoredTensor):
             return {"gaussians": dict(zip(CAPTURED, model, strict=True)), "iteration": step}
     return {type(value).__name__: value}
+
+
+def _unwrapped(entries: dict, levels: int = 3) -> dict:
+    """Entries without what torch puts in front of all names of a model that runs on several GPUs, or is
+    compiled."""
+    if levels == 0:
+        return entries
+    for prefix in WRAPPERS:
+        if entries and all(isinstance(name, str) and name.startswith(prefix) for name in entries):
+            entries = {name.removeprefix(prefix): value for name, value in entries.items()}
+    return {
+        name: _unwrapped(value, levels - 1) if type(value) is dict else value
+        for name, value in entries.items()
+    }
 
 
 def _unzipped(head: bytes) -> bytes:
@@ -207,6 +223,11 @@ def _check_snapshot(snapshot: dict, path: Path) -> None:
     """Raise for a snapshot of instant-ngp that is no radiance field, or of a version that is not known."""
     if (mode := snapshot.get("mode", "nerf")) not in ("nerf", 0):
         raise UnknownCheckpoint(f"{path}: holds instant-ngp's mode {str(mode)[:40]!r}, expected nerf")
+    if "mode" not in snapshot and "nerf" not in snapshot:  # of 2022
+        raise UnknownCheckpoint(
+            f"{path}: is a snapshot of instant-ngp without a radiance field, as of a surface or a picture; "
+            "give one of its nerf mode"
+        )
     version = snapshot.get("version")
     if type(version) is not int:
         raise OlderVersion(
@@ -248,7 +269,17 @@ SYSTEMS = {  # the first whose rule fits counts
         "kwargs:* state_dict/density_line.0:* state_dict/app_line.0:* "
         "| kwargs:* state_dict/plane_coef:* state_dict/line_coef:*",
     ),
+    "ccnerf": System(
+        "CCNeRF's own code",
+        "kwargs:* state_dict/S_vec.0:* | kwargs:* state_dict/S_mat.0:*",
+        is_read=False,
+    ),
     "svox2": System("Plenoxels (svox2)", "links:* density_data:* sh_data:* | links:* data:*", ("args.json",)),
+    "dbivoxgo": System(
+        "DVGO (two grids)",
+        "model_state_dict/scene_radius:* model_state_dict/density.0.*:* model_state_dict/k0.0.*:*",
+        is_read=False,
+    ),
     "dcvgo": System("DVGO (unbounded)", f"model_state_dict/scene_radius:* {_GRIDS}", ("config.py",)),
     "dmpigo": System(
         "DVGO (NDC)",
@@ -263,9 +294,16 @@ SYSTEMS = {  # the first whose rule fits counts
     ),
     "instant-ngp": System("instant-ngp", "snapshot/params_binary:*"),
     "hashnerf": System("HashNeRF", "network_fn_state_dict:* embed_fn_state_dict:*", ("args.txt",)),
+    "d-nerf": System(
+        "D-NeRF",
+        "network_fn_state_dict/_occ.pts_linears.0.weight:* network_fn_state_dict/_time.0.weight:*",
+        is_read=False,
+    ),
     "nerf-pytorch": System("nerf-pytorch", "network_fn_state_dict/pts_linears.0.weight:*", ("args.txt",)),
     "krrish-nerf": System(
-        "krrish94's nerf-pytorch", "model_coarse_state_dict/layer1.weight:*", ("config.yml",)
+        "krrish94's nerf-pytorch",
+        "model_coarse_state_dict/layer1.weight:* | model_coarse_state_dict/layers_xyz.0.weight:*",
+        ("config.yml",),
     ),
     "pvd": System(  # its hash grid has 14 levels, where torch-ngp's has 16
         "PVD",
@@ -356,6 +394,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _rank(file: Path) -> tuple[bool, bool, int]:
-    """How new a checkpoint is by its name."""
-    number = re.search(r"(\d{1,18})(?:_rank\d+)?$", file.stem)
-    return not file.stem.startswith("coarse"), "last" in file.stem, int(number[1]) if number else -1
+    """How new a checkpoint is by its name, which may end twice (torch-ngp's TensoRF: .pth.pth)."""
+    stem = file.stem.removesuffix(file.suffix)
+    number = re.search(r"(\d{1,18})(?:_rank\d+)?$", stem)
+    return not stem.startswith("coarse"), "last" in stem, int(number[1]) if number else -1

@@ -12,7 +12,7 @@ import numpy as np
 
 from formats.errors import BadSplats, LimitExceeded, counted
 from formats.splats.placing import keeps_shapes, placed
-from formats.splats.splats import Splats, check_count, gathered, joined
+from formats.splats.splats import Splats, check_count, gathered, joined, of_colours
 from formats.splats.spz import read_spz
 from formats.surfaces import gltf_schema as schema
 from formats.surfaces.accessors import Buffers
@@ -32,6 +32,7 @@ PACKED_AXES = (
     "holds SPZ, whose axes are taken for those of glTF, as CesiumJS does; by the draft of its extension the "
     "splats would stand turned by half a turn about y"
 )
+COLOUR = "COLOR_0"
 LINEAR = "lin_rec709_display"
 DEGREES = 3
 AXES = np.diag([-1.0, -1, 1, 1])
@@ -132,7 +133,7 @@ class _Reader:
             self.notes.add(PACKED_AXES, called)
             return self._unpacked(bytes(self.buffers.view(packed.buffer_view)), where)
         rows = {name: self._attribute(primitive, name, width, where) for name, width in ATTRIBUTES.items()}
-        harmonics = self._harmonics(primitive, where)
+        rows["OPACITY"], harmonics = self._shown(primitive, where)
         if len({len(each) for each in (*rows.values(), harmonics)}) > 1:
             raise BadSplats(f"{where}: its attributes differ in their number; export the file again")
         return _Part(
@@ -154,11 +155,22 @@ class _Reader:
 
     def _attribute(self, primitive: schema.Primitive, name: str, width: int, where: str) -> np.ndarray:
         full = name if name == "POSITION" else f"{SPLATTING}:{name}"
+        if full not in primitive.attributes and f"_{name}" in primitive.attributes:  # of the first draft
+            full = f"_{name}"
         if full not in primitive.attributes:
             raise BadSplats(f"{where}: its splats lack {full}; export the file again")
         # whole numbers of these stand for [0, 1] or [-1, 1], also where an exporter forgot to say so
         shares = name in ("ROTATION", "OPACITY")
         return self.buffers.numbers(primitive.attributes[full], (width,), scaled=shares)
+
+    def _shown(self, primitive: schema.Primitive, where: str) -> tuple[np.ndarray, np.ndarray]:
+        """Opacities (N, 1) and harmonics (N, K, 3); the first draft has colours and opacities in COLOR_0."""
+        own = [f"{SPLATTING}:{name}" in primitive.attributes for name in ("OPACITY", "SH_DEGREE_0_COEF_0")]
+        if any(own) or COLOUR not in primitive.attributes:
+            return self._attribute(primitive, "OPACITY", 1, where), self._harmonics(primitive, where)
+        rgba = self.buffers.numbers(primitive.attributes[COLOUR], (4,), scaled=True)
+        self.notes.add("has one colour for each splat, as a draft of the extension had it")
+        return rgba[:, 3:], of_colours(rgba[:, :3])
 
     def _harmonics(self, primitive: schema.Primitive, where: str) -> np.ndarray:
         """(N, K, 3) of whole degrees."""
@@ -197,7 +209,7 @@ class _Reader:
         return placed(splats, AXES @ world)
 
 
-ATTRIBUTES = {"POSITION": 3, "SCALE": 3, "ROTATION": 4, "OPACITY": 1}
+ATTRIBUTES = {"POSITION": 3, "SCALE": 3, "ROTATION": 4}
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,6 +58,16 @@ UNREAD = (
         "a .ply of Scaffold-GS, of which networks make splats",
         "give splats that need none",
     ),
+    Unread(
+        rb"ply[\r\n](?=.*property \S+ trbf_center\b)",
+        "a .ply of Spacetime Gaussians, which move and whose colours networks make",
+        "save one moment of it as a .ply of 3DGS",
+    ),
+    Unread(
+        rb'\s*\{(?=.*"means")(?=.*"opacities")(?=.*"sh0")(?=.*"dtype")',
+        "the meta.json of gsplat's PNG compression",
+        "give the checkpoint or the .ply that it was made from",
+    ),
 )
 
 
@@ -91,6 +101,13 @@ def newest_point_cloud(folder: Path | str) -> Path | None:
         return steps[max(steps)]
     places = [Path(folder) / name for name in ("lod-meta.json", "meta.json")]
     return next((place for place in places if place.is_file() and is_splats(place)), None)
+
+
+def is_moved(folder: Path | str, newest: Path) -> bool:
+    """Whether the newest splats of a run are moved by a network beside them, as 4DGaussians' and those of
+    Deformable-3DGS are."""
+    beside = newest.with_name("deformation.pth").is_file()
+    return beside or any(Path(folder).glob("deform/iteration_*/deform.pth"))
 
 
 @np.errstate(all="ignore")

@@ -96,6 +96,8 @@ class Meta(msgspec.Struct, rename={"rest": "shN"}):
     format: str = "sog"
     model: str = ""
     """Brush's and SplatTransform's: "antialiased", "2dgs" or nothing."""
+    antialias: bool | None = None
+    """PlayCanvas's."""
 
 
 # --- files --------------------------------------------------------------------------------------------------
@@ -113,7 +115,8 @@ def is_sog(path: Path | str) -> bool:
             names = pack.namelist()
     except BadSplats:
         return False
-    return any(name.rpartition("/")[2] == META for name in names) and any(n.endswith(".webp") for n in names)
+    pictures = any(name.endswith((".webp", ".png")) for name in names)
+    return pictures and any(name.rpartition("/")[2] == META for name in names)
 
 
 def read_sog(path: Path | str, data: bytes) -> Splats:
@@ -200,7 +203,8 @@ class _Reader:
         check_count(path, max(self.count, 0), sum(map(len, self.files.values())))
 
     def splats(self) -> Splats:
-        notes = [MODELS[self.meta.model]] if self.meta.model in MODELS else []
+        model = self.meta.model or ("antialiased" if self.meta.antialias else "")
+        notes = [MODELS[model]] if model in MODELS else []
         colours = self._rows(self.meta.sh0.files[0])
         values = self._values(self.meta.sh0, colours[:, :3])
         opacities = sigmoid(self._range(self.meta.sh0, colours, 3)) if self.old else colours[:, 3] / 255
@@ -278,7 +282,10 @@ class _Reader:
 
     def _rest(self, rest: Rest, notes: list[str]) -> np.ndarray:
         """(N, 3, 8 or 15, 3) float32 coefficients of the entries of the palette that splats have."""
-        palette = self._picture(rest.files[0], FREE_PIXELS)
+        files = rest.files[:2]
+        if "label" in files[0] and "label" not in files[1]:  # the order of the format's text
+            files = files[::-1]
+        palette = self._picture(files[0], FREE_PIXELS)
         height, width = palette.shape[:2]
         if width % PALETTE or width // PALETTE not in COEFFICIENTS:
             raise BadSplats(
@@ -290,7 +297,7 @@ class _Reader:
         else:
             book = self._book(rest.codebook)
         entries = palette.reshape(height * PALETTE, width // PALETTE, 4)[..., :3]
-        labels = self._rows(rest.files[1]).astype(np.int64)
+        labels = self._rows(files[1]).astype(np.int64)
         labels = labels[:, 0] + 256 * labels[:, 1]
         outside = labels >= len(entries)
         if outside.any():

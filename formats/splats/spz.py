@@ -43,6 +43,10 @@ AXES_EXTENSION = 0xADBE0003
 """SPZ_ADOBE_coordinate_system, a number: less one, its bits say right, up and front (instead of left, down
 and back), and the last that all is turned about x, as where z is up."""
 RIGHT_UP_BACK, RIGHT_DOWN_FRONT = 4, 6
+UNSTATED = (
+    "does not state its axes, which are taken as its format has them: right, up, back; where its writer left "
+    "those of a .ply, as SplatTransform, Spark and gsbox do, it stands upside down, and --up 0,1,0 mends that"
+)
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From axes with z up to those with y up: -90 degrees about x."""
 
@@ -98,7 +102,7 @@ class _Packed:
             notes.append(ANTIALIASED)
         known = SMOOTHED | EXTENDED | (LEVELLED if self.levelled else 0)
         not_honoured([hex(1 << i) for i in range(8) if flags & ~known & 1 << i], notes, "flags")
-        self.axes = RIGHT_UP_BACK
+        self.axes, self.stated = RIGHT_UP_BACK, False
         self.arrays: dict[str, np.ndarray] = {}
 
     @property
@@ -121,7 +125,8 @@ class _Packed:
             at += 8 + length
             if kind == AXES_EXTENSION and length == 4 and at <= len(data):
                 (axes,) = struct.unpack_from("<I", data, at - 4)
-                self.axes = axes if 1 <= axes <= 16 else RIGHT_UP_BACK
+                self.stated = 1 <= axes <= 16
+                self.axes = axes if self.stated else RIGHT_UP_BACK
             else:
                 names.append(f"0x{kind:08X}")
         not_honoured(names, self.notes, "extensions")
@@ -139,6 +144,8 @@ class _Packed:
 
     def splats(self, as_stored: bool) -> Splats:
         """An axis that changes its sign changes those of harmonics, and two of a quaternion's."""
+        if not self.stated and not as_stored:
+            self.notes.append(UNSTATED)
         bits = self.axes - 1 ^ RIGHT_DOWN_FRONT - 1
         turn = np.ones(3) if as_stored else 1.0 - 2 * np.array([bits & 1, bits >> 1 & 1, bits >> 2 & 1])
         point = np.array([[0.3, 0.5, 0.7]])

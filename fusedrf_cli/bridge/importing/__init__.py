@@ -16,7 +16,7 @@ from formats.foreign.systems import SYSTEMS, Checkpoint, open_checkpoint
 from formats.graph import free_name, placement_of
 from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node
-from formats.splats.reading import is_splats, newest_point_cloud
+from formats.splats.reading import is_moved, is_splats, newest_point_cloud
 from formats.splats.splats import UP_Z
 from formats.views import Capture
 from fusedrf_cli import __version__
@@ -52,9 +52,16 @@ BOXLESS = "nerf-pytorch", "krrish-nerf", "hashnerf", "d2nerf"
 """Systems whose files have no box."""
 MOVING = "k-planes", "d2nerf"
 """Systems whose scenes may move."""
+MOVED = "nerfacto", "splatfacto"
+"""Systems whose runs tell how they moved their captures."""
 SPLATS = "splatfacto", "gsplat", "3dgs"
 """Systems whose scenes are Gaussian splats."""
-UNREAD = {"dmpigo": dvgo.FORWARD}
+UNREAD = {
+    "dmpigo": dvgo.FORWARD,
+    "dbivoxgo": "train it with DVGO's contracted model",
+    "ccnerf": "train it with CCNeRF of torch-ngp (main_CCNeRF.py)",
+    "d-nerf": "its points are moved by a network of time; train it with 'nerf_type = original'",
+}
 """Why checkpoints of a system are not read, where that is known."""
 COPIES = 5.5
 """Of an array, of what its field takes: read, rearranged, as numbers and as they are written."""
@@ -70,6 +77,10 @@ def import_field(request: ImportRequest, progress) -> dict:
         check_boxless(request)
         system, imported = "Gaussian splats", splats.read(newest or request.path, memory)
         taken = [] if newest is None else [f"{request.path}: its newest splats are taken, {newest}"]
+        if newest is not None and is_moved(request.path, newest):
+            taken.append(
+                f"{request.path}: its splats move, by a network that is not read; they stand where they rest"
+            )
         imported = replace(imported, notes=[*taken, *imported.notes, *unmoved(request)])
     else:
         system, imported = of_system(request, capture, memory)
@@ -129,6 +140,7 @@ def imported_from(
     given = {"box": box_of(request, capture, checkpoint)} if boxless else {}
     given |= {"time": request.time} if checkpoint.system in MOVING else {}
     given |= {"memory": memory} if checkpoint.system in SPLATS else {}
+    given |= {"capture": capture} if checkpoint.system in MOVED else {}
     try:
         imported = read(checkpoint, **given)
     except (FormatError, ValueError) as error:
@@ -141,7 +153,7 @@ def imported_from(
 
 def check_boxless(request: ImportRequest) -> None:
     """UsageProblem where a box is given of a file that has its own."""
-    if request.aabb or request.near or request.far:
+    if any(given is not None for given in (request.aabb, request.near, request.far)):
         raise UsageProblem(
             f"{request.path}: has a box of its own, and --aabb, --near and --far are for files without one; "
             "leave them out"
@@ -156,13 +168,18 @@ def unmoved(request: ImportRequest) -> list[str]:
 def box_of(request: ImportRequest, capture: Capture | None, checkpoint: Checkpoint) -> np.ndarray:
     """The box (6,) of a field whose file has none: as given, or what cameras see between two distances."""
     if request.aabb is not None:
-        if request.near or request.far:
+        if request.near is not None or request.far is not None:
             raise UsageProblem("--aabb is the box itself; leave out --near and --far")
         box = np.array(request.aabb)
         if not (box[:3] < box[3:]).all():
             raise UsageProblem(f"--aabb should be three minima below three maxima, found {request.aabb}")
         return box
     if checkpoint.system == "hashnerf":
+        if request.near is not None or request.far is not None:
+            raise UsageProblem(
+                f"{request.path}: its hash grid fills a box, which --near and --far do not tell; give it as "
+                "--aabb, or leave them out where args.txt lies beside it"
+            )
         if (stated := nerf.hashed_box(checkpoint)) is None:
             raise UsageProblem(
                 f"{request.path} does not say which box its hash grid fills; give it as --aabb "
@@ -173,6 +190,11 @@ def box_of(request: ImportRequest, capture: Capture | None, checkpoint: Checkpoi
         raise UsageProblem(
             f"{request.path} does not say where its scene lies; give the box as --aabb "
             "xmin,ymin,zmin,xmax,ymax,zmax, or --near, --far and the capture as --cameras"
+        )
+    if nerf.in_ndc(checkpoint):
+        raise UsageProblem(
+            f"{request.path} was trained in normalised device coordinates, in which a capture's cameras do "
+            "not lie; give its box there as --aabb, such as -1.5,-1.67,-1,1.5,1.67,1"
         )
     if not request.near < request.far:
         raise UsageProblem(f"--near {request.near:g} should be less than --far {request.far:g}")

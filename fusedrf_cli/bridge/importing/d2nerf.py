@@ -3,25 +3,33 @@ time."""
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from formats.errors import FormatError
+from fusedrf_cli.bridge.importing.flax_networks import (
+    Columns,
+    Trunk,
+    behind,
+    colours_of,
+    columns_of,
+    diagonal,
+    frequencies_of,
+    layer_of,
+    layers_of,
+    sections_of,
+    side_by_side,
+    trunk_of,
+)
 from fusedrf_cli.bridge.importing.nerf import SAMPLES, stacked
 from fusedrf_cli.bridge.importing.parts import (
-    ColourInput,
     Entries,
     Imported,
     ImportedNode,
     Layer,
-    check_layers,
-    colour_network,
     eight,
-    packed,
     parts_field,
-    scattered,
 )
 from fusedrf_cli.engine.encodings import warped_frequencies
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
@@ -30,32 +38,13 @@ from fusedrf_cli.errors import UsageProblem
 
 TWIST = 6  # numbers that move a point
 READ = {
-    "norm_type": "none", "activation": "relu", "sigma_activation": "softplus", "blend_mode": "add",
+    "norm_type": "none", "activation": "relu", "sigma_activation": "softplus",
     "use_pivot": "False", "use_translation": "False", "spatial_point_min_deg": "0",
     "hyper_point_min_deg": "0", "viewdir_min_deg": "0", "min_deg": "0",
 }  # fmt: skip
 """Of settings that are not in the file, the only value that is read."""
 NONE = {"count": 0, "hidden": 8, "layers": 1, "skip": 0}
 """A network that does nothing."""
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Where the inputs (N,) of a network lie among our features, and what each is to be multiplied by. The
-    inputs behind them are `constants`."""
-
-    at: np.ndarray
-    factors: np.ndarray
-    constants: np.ndarray
-
-
-@dataclass(frozen=True)
-class Trunk:
-    """Rectified layers, of which the first reads our features, and the weights by which others read them
-    again."""
-
-    layers: list[Layer]
-    again: dict[int, np.ndarray]
 
 
 class Model:
@@ -137,146 +126,7 @@ def read(checkpoint, box: np.ndarray, time: float | None = None) -> Imported:
     return Imported(nodes, notes, "add")
 
 
-# -- networks of Flax ----------------------------------------------------------------------------------------
-
-
-def layer_of(place: Entries, name: str) -> Layer:
-    """A dense layer, whose kernel is (inputs, outputs)."""
-    layer = place.inside(name)
-    kernel = layer.array("kernel", None, None)
-    return kernel.T, layer.array("bias", kernel.shape[1]) if "bias" in layer.values else None
-
-
-def layers_of(place: Entries, prefix: str = "hidden_") -> list[Layer]:
-    """The hidden layers whose names begin so."""
-    found: list[Layer] = []
-    while f"{prefix}{len(found)}" in place.values:
-        found.append(layer_of(place, f"{prefix}{len(found)}"))
-    if not found:
-        raise FormatError(f"{place.where}'{prefix}0' is missing")
-    return found
-
-
-def frequencies_of(inputs: int) -> tuple[int, bool]:
-    """Of an encoding of so many numbers, and whether the point itself comes first."""
-    count, rest = divmod(inputs, 6)
-    if rest not in (0, 3) or not 0 <= count <= 24:
-        raise FormatError(
-            f"a network of points should read 6 numbers a frequency, and 3 more or none, found {inputs}"
-        )
-    return count, rest == 3
-
-
-def columns_of(start: int, count: int, identity: bool, window: np.ndarray, constants=()) -> Columns:
-    """Of a point's frequencies among our features, from `start` on."""
-    at = np.arange(0 if identity else 3, 3 + 6 * count)
-    factors = np.concatenate([np.ones(3 * identity), np.repeat(window, 6)])
-    return Columns(start + at, factors, np.asarray(constants, np.float64))
-
-
-def trunk_of(layers: Sequence[Layer], columns: Columns, width: int) -> Trunk:
-    """The layers over `width` features. One that reads the input again does so behind what the layer before
-    it made."""
-    inputs, made, again = len(columns.at) + len(columns.constants), [], {}
-    for i, (weight, bias) in enumerate(layers):
-        bias = np.zeros(len(weight)) if bias is None else bias.astype(np.float64)
-        before = len(layers[i - 1][0]) if i else 0
-        if weight.shape[1] not in (before, before + inputs)[i == 0 :]:
-            raise FormatError(
-                f"layer {i} of a network should read {before or inputs} numbers, found {weight.shape[1]}"
-            )
-        read = weight[:, before:].astype(np.float64)
-        if read.shape[1]:
-            bias = bias + read[:, len(columns.at) :] @ columns.constants
-            read = scattered(read[:, : len(columns.at)] * columns.factors, columns.at, width)
-            again |= {i: read} if i else {}
-        made.append((weight[:, :before] if i else read, bias))
-    if len(again) > 1:
-        raise FormatError("more than one layer reads the point again, which is not taken over")
-    return Trunk(made, again)
-
-
-def sections_of(prefix: str, trunk: Trunk, last: Layer) -> tuple[dict[str, int], dict[str, np.ndarray]]:
-    """The options hidden, layers and skip of a network with a last layer, and its sections."""
-    layers = [*trunk.layers, last]
-    width = layers[0][0].shape[1]
-    hidden = check_layers(layers, width)
-    sections = {
-        f"{prefix}layer_{i}": packed(weight, bias, hidden if i else width)
-        for i, (weight, bias) in enumerate(layers)
-    }
-    for weight in trunk.again.values():
-        sections[f"{prefix}again"] = weight.T
-    return {"hidden": hidden, "layers": len(layers) - 1, "skip": next(iter(trunk.again), 0)}, sections
-
-
-def side_by_side(first: Trunk, second: Trunk) -> Trunk:
-    """Two trunks over the same features as one. A rectified layer may be passed on unchanged."""
-    if first.again and second.again and first.again.keys() != second.again.keys():
-        raise FormatError("the networks of shadow and static scene read the point again in different layers")
-    layers, again = [], {}
-    for i in range(max(len(first.layers), len(second.layers))):
-        pair = [passed_on(trunk, i) for trunk in (first, second)]
-        blocks = [np.concatenate([weight for weight, _ in pair])] if i == 0 else [w for w, _ in pair]
-        layers.append((diagonal(*blocks), np.concatenate([bias for _, bias in pair])))
-        if i in first.again or i in second.again:
-            width = layers[0][0].shape[1]
-            both = zip((first, second), pair, strict=True)
-            again[i] = np.concatenate([t.again.get(i, np.zeros((len(w), width))) for t, (w, _) in both])
-    return Trunk(layers, again)
-
-
-def passed_on(trunk: Trunk, i: int) -> Layer:
-    """A layer of a trunk, or behind the last one that hands it on."""
-    count = len(trunk.layers[-1][0])
-    return trunk.layers[i] if i < len(trunk.layers) else (np.eye(count), np.zeros(count))
-
-
-def diagonal(*blocks: np.ndarray) -> np.ndarray:
-    """A matrix of blocks on its diagonal."""
-    made = np.zeros(np.sum([block.shape for block in blocks], 0))
-    for block, (row, column) in zip(
-        blocks, np.cumsum([(0, 0), *(b.shape for b in blocks[:-1])], 0), strict=True
-    ):
-        made[row : row + block.shape[0], column : column + block.shape[1]] = block
-    return made
-
-
-def behind(network: Entries, alpha: str, rows: slice, code: np.ndarray) -> tuple[Layer, int]:
-    """The layer behind a trunk that makes the density, by the `rows` of the layer `alpha`, and then what the
-    colour reads; and how much that is."""
-    weight, bias = layer_of(network.inside(alpha), "logit")
-    bias = np.zeros(len(weight)) if bias is None else bias
-    if "bottleneck" in network.values:
-        bottleneck = layer_of(network, "bottleneck")
-    else:
-        bottleneck = np.eye(weight.shape[1]), None
-    if weight.shape[1] != bottleneck[0].shape[1]:  # it reads the bottleneck and a code
-        count = len(bottleneck[0])
-        inner = 0 if bottleneck[1] is None else bottleneck[1]
-        if weight.shape[1] != count + len(code):
-            raise FormatError(f"{network.where}'{alpha}' should read {count} numbers and a code")
-        bias = bias + weight[:, :count] @ inner + weight[:, count:] @ code
-        weight = weight[:, :count] @ bottleneck[0]
-    return stacked((weight[rows], bias[rows]), bottleneck), len(bottleneck[0])
-
-
-def colours_of(network: Entries, name: str, outputs: int, features: int, code: np.ndarray):
-    """The entry and sections of a colour network that reads a trunk's outputs but for the first, the
-    direction's frequencies and a code."""
-    place = network.inside(name)
-    layers = [*layers_of(place), layer_of(place, "logit")]
-    (weight, bias), *others = layers
-    seen = weight.shape[1] - features - len(code)
-    if seen < 0:
-        raise FormatError(f"{place.where}'hidden_0' should read {features} numbers and more")
-    count, identity = frequencies_of(seen)
-    bias = (0 if bias is None else bias) + weight[:, features + seen :].astype(np.float64) @ code
-    order = ColourInput(1 + features, outputs, count, alone=True)
-    directions = [order.at("direction")] if identity else []
-    columns = [order.at("features")[1:], *directions, order.waves("direction", count, by_level=True)]
-    layers = [(weight[:, : features + seen], bias), *others]
-    return colour_network(layers, order, np.concatenate(columns))
+# -- fields -----------------------------------------------------------------------------------------------
 
 
 def field_of(encoding: dict, sigma: dict, rgb: dict, values: dict, box: np.ndarray) -> PartsField:
@@ -295,6 +145,11 @@ class Dynamic:
 
     def __init__(self, model: Model, time: float):
         self.model, self.state, self.network = model, model.state, model.state.inside(model.level)
+        if "MLP_2" in self.network.values:
+            raise FormatError(
+                "its moving part has a weight by which it is blended (blend_mode old or nsff of earlier "
+                "versions), which is not read; train it with 'add'"
+            )
         self.time, self.warp_code = time, model.code("warp_embed", time)
         own = model.code("hyper_embed", time)
         self.hyper_code = own if len(own) else self.warp_code
@@ -310,16 +165,24 @@ class Dynamic:
         """The options and sections of the network that moves points."""
         if "warp_field" not in self.state.values:
             return NONE, empty("density_warp_", 8)
-        place = self.state.inside("warp_field")
+        place, alpha, prefix = self.state.inside("warp_field"), "warp_alpha", "density_warp_"
+        if "mlp" in place.values:  # points are only pushed
+            network = place.inside("mlp")
+            weight, bias = layer_of(network, "logit")
+            still = np.zeros_like(weight), None if bias is None else np.zeros_like(bias)
+            last = stacked(still, (weight, bias))
+            return self.moving(layers_of(network), last, alpha, self.warp_code, prefix)
+        if more := {"branches_p", "branches_t"} & set(place.values):
+            raise FormatError(
+                f"{place.where}{min(more)} (use_pivot, use_translation) is not read; train it without"
+            )
         branches = [place.inside(f"branches_{name}") for name in "wv"]
         if any("hidden_0" in branch.values for branch in branches):
             raise FormatError(f"{place.where}branches with hidden layers are not taken over")
         last = stacked(*(layer_of(branch, "logit") for branch in branches))
         if len(last[0]) != TWIST:
             raise FormatError(f"{place.where}branches should make {TWIST} numbers, found {len(last[0])}")
-        return self.moving(
-            layers_of(place.inside("trunk")), last, "warp_alpha", self.warp_code, "density_warp_"
-        )
+        return self.moving(layers_of(place.inside("trunk")), last, alpha, self.warp_code, prefix)
 
     def sheeted(self) -> tuple[dict, int, dict[str, np.ndarray]]:
         """The options of the network that gives points coordinates, how many, and its sections."""
@@ -400,7 +263,8 @@ class Dynamic:
                 layer_of(place.inside("MLP_0"), "logit"),
             )
         elif len(alpha[0]) > 1:
-            layers, (weight, bias) = self.layers, alpha
+            weight, bias = behind(self.network, "MLP_1", slice(-1, None), self.code)[0]
+            layers, weight, bias = self.layers, weight[:1], bias[:1]
         else:
             return None
         shift = self.model.setting("shadow_r_shift", 0.0)

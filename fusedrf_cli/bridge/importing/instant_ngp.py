@@ -111,8 +111,9 @@ def levels_of(encoding: Entries, scale: int) -> tuple[list[dict], int]:
             raise FormatError(f"encoding: '{key}' should be {expected}, found {found[:40]!r}")
     features = encoding.whole("n_features_per_level", 1, 8, 2)
     count = encoding.whole("n_features", 0, 256, 0) // features or encoding.whole("n_levels", 1, 32, 16)
-    log2_rows = encoding.whole("log2_hashmap_size", 1, 26, 15)
-    base = encoding.whole("base_resolution", 0, 4096, 0) or 1 << log2_rows // 3
+    log2_rows = encoding.whole("log2_hashmap_size", 1, 26, 19)
+    usual = encoding.whole("log2_hashmap_size", 1, 26, 15)  # the program's own, beside its library's
+    base = encoding.whole("base_resolution", 0, 4096, 0) or 1 << usual // 3
     growth = encoding.number("per_level_scale", 0.0)
     if growth <= 0:
         ratio = np.float32(FINEST) * np.float32(scale) / np.float32(base)
@@ -194,13 +195,20 @@ def check_directions(root: Entries) -> None:
 
 def halves(snapshot: Entries) -> np.ndarray:
     """The parameters, as the program computes with them."""
-    kind = snapshot.get("params_type")
+    kind = snapshot.values.get("params_type", missing_type(snapshot))
     if kind not in ("__half", "float"):
         raise FormatError(f"snapshot: 'params_type' should be __half or float, found {str(kind)[:40]!r}")
     values = numbers(snapshot, "params_binary", np.float16 if kind == "__half" else np.float32)
     if np.isinf(values).any():
         raise FormatError("snapshot: 'params_binary' holds infinity")
     return values
+
+
+def missing_type(snapshot: Entries) -> str:
+    """The type of the parameters of a snapshot of 2022 that does not say it, by how many they are."""
+    held, count = snapshot.values.get("params_binary"), snapshot.values.get("n_params")
+    whole = isinstance(held, bytes) and isinstance(count, int) and len(held) == 4 * count
+    return "float" if whole else "__half"
 
 
 def numbers(entries: Entries, name: str, dtype: type) -> np.ndarray:

@@ -58,7 +58,7 @@ def read(checkpoint, time: float | None = None) -> Imported:
         box = box + np.concatenate([-reach, reach])
     features, width = grids[0][0].shape[-1], eight(grids[0][0].shape[-1])
     encoding, values = planes_of(grids, width, flipped)
-    sigma_net, summed = density_net(state, features, len(grids), settings)
+    sigma_net, summed = density_net(state, features, len(grids), settings, notes)
     encoding |= {"summed": summed, "margin": margin}
     columns = np.concatenate([s * width + np.arange(features) for s in range(1 if summed else len(grids))])
     codes = codes_of(state, notes)
@@ -188,7 +188,7 @@ def where(state: Entries):
 
 
 def density_net(
-    state: Entries, features: int, scales: int, settings: Mapping[str, Any]
+    state: Entries, features: int, scales: int, settings: Mapping[str, Any], notes: list[str]
 ) -> tuple[list[Layer], bool]:
     """The layers of sigma_net, and whether it reads the sum of the scales' features, not all of them."""
     params = halves(state, FIELD + "sigma_net.params")
@@ -209,6 +209,11 @@ def density_net(
         raise FormatError(
             f"'{FIELD}sigma_net.params' has {len(params):,} numbers, which no network of {features} features "
             f"at {scales} scales does"
+        )
+    if len(fitting) > 1 and scales > 1 and "concat_features_across_scales" not in settings:
+        notes.append(
+            "no config.py lies beside it: its network is taken to read the features of all scales beside "
+            "each other, as its recipes have it, and not their sum"
         )
     concatenated = settings.get("concat_features_across_scales", not fitting[0][1])
     return next((found for found in fitting if found[1] != concatenated), fitting[0])

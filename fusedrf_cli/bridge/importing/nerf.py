@@ -43,6 +43,12 @@ def read(checkpoint, box: np.ndarray) -> Imported:
     FormatError."""
     state, notes = network_of(checkpoint, "network_fn_state_dict", "network_fine_state_dict")
     check_biases(state)
+    kind = checkpoint.beside.get("args.txt", {}).get("i_embed", 0)
+    if kind not in (0, -1):
+        raise FormatError(
+            f"args.txt beside it says 'i_embed = {str(kind)[:20]}', an encoding that is not read; train it "
+            "with 0 or -1"
+        )
     layers = state.layers("pts_linears.")
     encoding = encoding_of(layers[0][0].shape[1])
     if "output_linear.weight" in state.values:
@@ -64,6 +70,11 @@ def read_krrish(checkpoint, box: np.ndarray) -> Imported:
     check_sampling(checkpoint)
     state, notes = network_of(checkpoint, "model_coarse_state_dict", "model_fine_state_dict")
     check_biases(state)
+    if not {"layer1.weight", "layers_xyz.0.weight"} <= set(state.values):
+        raise FormatError(
+            "its network is no FlexibleNeRFModel, the only one of these that is read; train it with 'type: "
+            "FlexibleNeRFModel'"
+        )
     first, layers = state.layer("layer1"), state.layers("layers_xyz.")
     inputs, hidden = first[0].shape[1], len(layers[-1][0])
     layers[0] = joined(first, layers[0])  # the first has no activation
@@ -145,13 +156,18 @@ def hashed_box(checkpoint) -> np.ndarray | None:
 
 def network_of(checkpoint, coarse: str, fine: str) -> tuple[Entries, list[str]]:
     """The state of the fine network, or of the only one, and what is to be said of it."""
-    entries, beside = Entries(checkpoint.entries), checkpoint.beside
-    args, dataset = beside.get("args.txt", {}), beside.get("config.yml", {}).get("dataset")
+    entries = Entries(checkpoint.entries)
     notes = [FINE] if entries.values.get(fine) else []
-    no_ndc = dataset.get("no_ndc") if isinstance(dataset, dict) else args.get("no_ndc")
-    if no_ndc is False and args.get("dataset_type", "llff") == "llff":
-        notes.append(NDC)
+    notes += [NDC] if in_ndc(checkpoint) else []
     return entries.inside(fine if entries.values.get(fine) else coarse), notes
+
+
+def in_ndc(checkpoint) -> bool:
+    """Whether the settings beside a checkpoint say that it was trained in normalised device coordinates."""
+    args = checkpoint.beside.get("args.txt", {})
+    dataset = checkpoint.beside.get("config.yml", {}).get("dataset")
+    no_ndc = dataset.get("no_ndc") if isinstance(dataset, dict) else args.get("no_ndc")
+    return no_ndc is False and args.get("dataset_type", "llff") == "llff"
 
 
 def check_biases(state: Entries) -> None:

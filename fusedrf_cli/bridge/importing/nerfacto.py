@@ -10,6 +10,8 @@ import torch
 
 from formats.errors import FormatError
 from formats.splats.splats import UP_Z
+from formats.transforms import Applied, applied_to
+from formats.views import Capture
 from fusedrf_cli.bridge.importing import tcnn
 from fusedrf_cli.bridge.importing.parts import (
     ColourInput,
@@ -39,12 +41,16 @@ BALL, BOX = 2, 0
 DEPTHS = 1, 2, 3, 4, 5, 6, 0  # hidden layers that networks may have beside the usual
 MOST_SAMPLES = 512  # vertices along an axis by which rays are sampled
 DENSITY = 0.01  # average_init_density of the recipe
+SEMANTIC = "mlp_semantics", "field_head_semantics"
+"""In front of the names of what Semantic NeRF-W has beside: its densities begin at 1."""
+CONVERTED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
+"""What was done to the poses of COLMAP before captures said so."""
 OWN_ARRAYS = "mlp_base.params", "mlp_base.model.params", "mlp_base_mlp.tcnn_encoding.params"
 """Names of the network of density where tiny-cuda-nn computes it: of 2022, now, and of 2023."""
 
 
-def read(checkpoint) -> Imported:
-    """The field of a checkpoint. Raises FormatError."""
+def read(checkpoint, capture: Capture | None = None) -> Imported:
+    """The field of a checkpoint, where its capture lies. Raises FormatError."""
     pipeline = named(Entries(checkpoint.entries).inside("pipeline"))
     state = state_of(pipeline, FIELD)
     marched = any(name.startswith("_model.occupancy_grid.") for name in pipeline)
@@ -76,7 +82,7 @@ def read(checkpoint) -> Imported:
         )
     numbers = {"density_rows": rows} | sections | more
     field = parts_field(shape, cells.aabb, resolution, numbers, scale * frame[0, 0], occupancy=cells)
-    placement, said = placement_of(checkpoint.beside.get("dataparser_transforms.json"))
+    placement, said = placement_of(checkpoint.beside.get("dataparser_transforms.json"), capture)
     if codes is not None:
         said.append(f"its appearance codes are fixed to {'their mean' if codes.any() else '0'}")
     return Imported([ImportedNode(field, placement @ frame)], notes + said, up=up_of(placement))
@@ -127,6 +133,7 @@ def density_of(state: Entries, settings: Entries, marched: bool) -> tuple[float,
             raise FormatError(f"config.yml: 'average_init_density' should be above 0, found {scale:g}")
         return scale, []
     before = marched or not {"mlp_base.model.params", "mlp_base.model.0.hash_table"} & set(state.values)
+    before |= any(name.startswith(SEMANTIC) for name in state.values)
     scale = 1.0 if before else DENSITY
     shown = "none" if marched else "the mean"
     return scale, [
@@ -200,6 +207,11 @@ def folded(head: list[Layer], codes: np.ndarray | None, read: int) -> list[Layer
 def torch_base(state: Entries, finest: int, count: int, log2_rows: int, base: int):
     """The levels of the hash grid, its rows, and the trunk's layers."""
     now = "mlp_base.model.0.hash_table" in state.values
+    if not now and "mlp_base_grid.hash_table" not in state.values:
+        raise FormatError(
+            "its field is another method's of nerfstudio than nerfacto's, which is not read; import one of "
+            "nerfacto, instant-ngp or splatfacto"
+        )
     table, network = (
         ("mlp_base.model.0.", "mlp_base.model.1.") if now else ("mlp_base_grid.", "mlp_base_mlp.")
     )
@@ -268,7 +280,14 @@ def tcnn_base(state: Entries, settings: Entries, finest: list[int], count: int, 
         ):
             layers, rest = tcnn.network_of(params, shapes, count * features, outputs, 1.0 if apart else 0.0)
             return levels, tcnn.rows_of(rest if table is None else table, levels, features), layers
-    raise FormatError(f"'{FIELD}{name}' has {len(params):,} numbers, which no network over its grid has")
+    raise FormatError(
+        f"'{FIELD}{name}' has {len(params):,} numbers, which no network over its grid has{unsure(settings)}"
+    )
+
+
+def unsure(settings: Entries) -> str:
+    """What to do where no settings say how large networks are."""
+    return "" if settings.values else "; put its run's config.yml beside it"
 
 
 def tcnn_levels(finest: int, count: int, log2_rows: int, base: int) -> list[dict]:
@@ -289,7 +308,10 @@ def tcnn_head(state: Entries, settings: Entries, most: int, codes: int) -> tuple
         shapes = tcnn.shapes_of(read, neurons, hidden, 3, by_of(neurons))
         if tcnn.size_of(shapes) == len(params):
             return tcnn.network_of(params, shapes, read, 3, 1.0)[0], outputs
-    raise FormatError(f"'{FIELD}{name}' has {len(params):,} numbers, which no network over its features has")
+    raise FormatError(
+        f"'{FIELD}{name}' has {len(params):,} numbers, which no network over its features has"
+        f"{unsure(settings)}"
+    )
 
 
 def widths(settings: Entries, name: str) -> dict[int, None]:
@@ -314,19 +336,46 @@ def halves(state: Entries, name: str) -> np.ndarray:
 # -- where it lies -------------------------------------------------------------------------------------------
 
 
-def placement_of(transforms: Any) -> tuple[np.ndarray, list[str]]:
-    """(4, 4) from the model's coordinates to the capture's, and notes: model = scale (R p + t)."""
-    placement, notes = np.eye(4), []
+def placement_of(transforms: Any, capture: Capture | None = None) -> tuple[np.ndarray, list[str]]:
+    """(4, 4) from the model's coordinates to the capture's, and notes: model = scale (R p + t). p is of the
+    world in which the poses were estimated; of poses that A moved and s scaled before a capture's file had
+    them, model = scale / s T p' with T A = [R t]."""
     if not isinstance(transforms, Mapping):
-        return placement, ["no dataparser_transforms.json lies beside it: it stays where nerfstudio moved it"]
+        return np.eye(4), ["no dataparser_transforms.json lies beside it: it stays where nerfstudio moved it"]
     entries = Entries(transforms, "dataparser_transforms.json: ")
     matrix, scale = entries.array("transform", 3, 4).astype(np.float64), entries.number("scale")
-    forward = np.eye(4)
-    forward[:3] = scale * matrix
-    if not abs(np.linalg.det(forward)) > 1e-30:
-        raise FormatError("dataparser_transforms.json: the transform cannot be undone")
-    notes.append("it lies where its capture does: dataparser_transforms.json is undone")
-    return np.linalg.inv(forward), notes
+    tried = [Applied(np.eye(4)[:3], 1.0)] if capture is None else applied_in(capture)
+    placements = []
+    for applied in tried:
+        forward, moved = np.eye(4), np.eye(4)
+        forward[:3], moved[:3] = scale / applied.scale * matrix, applied.matrix
+        if not all(1e-30 < abs(np.linalg.det(m)) < 1e30 for m in (forward, moved)):
+            raise FormatError("dataparser_transforms.json: the transform cannot be undone")
+        placements.append(moved @ np.linalg.inv(forward))
+    said = "it lies where its capture does: dataparser_transforms.json is undone"
+    if capture is None:
+        said += "; where its transforms.json has an applied_transform, --cameras undoes that as well"
+    return min(placements, key=lambda placement: off_centre(placement, capture)), [said]
+
+
+def applied_in(capture: Capture) -> list[Applied]:
+    """What nerfstudio may have taken for what was done to the poses of a capture: what its file says, else
+    nothing, or since 2023 what its own converter used to do."""
+    if (stated := applied_to(capture)) is not None:
+        return [stated]
+    folder = capture.path if capture.path.is_dir() else capture.path.parent
+    converted = [Applied(CONVERTED, 1.0)] if (folder / "colmap/sparse/0").is_dir() else []
+    return [Applied(np.eye(4)[:3], 1.0), *converted]
+
+
+def off_centre(placement: np.ndarray, capture: Capture | None) -> float:
+    """How far from the middle of the model, where nerfstudio puts it, that of a capture's cameras would
+    be."""
+    if capture is None:
+        return 0.0
+    views = capture.train + capture.test
+    middle = np.mean([view.camera_to_world[:, 3] for view in views], 0)
+    return float(np.linalg.norm((np.linalg.inv(placement) @ [*middle[:3], 1])[:3]))
 
 
 def up_of(placement: np.ndarray) -> tuple[float, ...]:

@@ -26,6 +26,7 @@ from formats.splats.splats import (
     sigmoid,
     sizes_of,
 )
+from formats.views import Capture
 from fusedrf_cli.bridge.importing.nerfacto import model_settings, named, placement_of, state_of, up_of
 from fusedrf_cli.bridge.importing.parts import Entries, Imported
 from fusedrf_cli.bridge.importing.splats import fields_of
@@ -82,9 +83,9 @@ def read(checkpoint: Checkpoint, memory: Memory) -> Imported:
     return fields_of(made(checkpoint), memory)
 
 
-def read_splatfacto(checkpoint: Checkpoint, memory: Memory) -> Imported:
+def read_splatfacto(checkpoint: Checkpoint, memory: Memory, capture: Capture | None = None) -> Imported:
     """The fields of splatfacto's splats, where their capture lies. Raises FormatError."""
-    placement, said = placement_of(checkpoint.beside.get("dataparser_transforms.json"))
+    placement, said = placement_of(checkpoint.beside.get("dataparser_transforms.json"), capture)
     return fields_of(of_splatfacto(checkpoint, up_of(placement)), memory, placement, said)
 
 

@@ -26,7 +26,7 @@ MOST_CELLS = 256
 """Along an axis."""
 SH, TEXTURE, NETWORK = 1, 4, 255
 """Of `basis_type`."""
-NDC = "it was learnt in NDC of its cameras, whose lenses it does not tell: it lies as it is there"
+NDC = "it seems to be learnt in NDC of its cameras, whose lenses it does not tell: it lies as it is there"
 MLP = "pt__basis_mlp__"
 """In front of the names of its layers."""
 
@@ -40,7 +40,10 @@ def read(checkpoint) -> Imported:
     nodes = [grid_of(entries, middle, radius)]
     if background := background_of(entries, middle, radius):
         nodes = [replace(nodes[0], suffix=" grid"), background]
-    in_ndc = checkpoint.beside.get("args.json", {}).get("dataset_type") == "llff"
+    kind = checkpoint.beside.get("args.json", {}).get("dataset_type", "auto")
+    # of LLFF's captures its own loader makes such a box, and nothing else does
+    forward = not middle.any() and radius[2] == 1 and (radius[:2] > 1).all()
+    in_ndc = kind == "llff" or kind == "auto" and bool(forward)
     return Imported(nodes, [NDC] * in_ndc, rule="add")
 
 

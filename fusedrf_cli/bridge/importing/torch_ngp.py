@@ -39,6 +39,8 @@ AXES = {f"plane_{i}": pair for i, pair in enumerate(((0, 1), (0, 2), (1, 2)))} |
     f"line_{i}": (2 - i,) for i in range(3)
 }
 """Along which each of TensoRF's planes and lines runs."""
+LINE_AXES = {f"line_{axis}": (axis,) for axis in range(3)}
+"""The same of lines alone."""
 FRAME = (
     "it lies in the system's own coordinates, which are the capture's y, z, x, scaled and moved by options "
     "that it does not hold"
@@ -162,14 +164,13 @@ def planes(
     rgb, sections = colour_network(layers, order, np.concatenate(columns), rows=count)
     filled = ranks_filled(ranks)
     basis = beside(np.split(basis, np.cumsum(ranks)[:-1], 1), filled)
-    box = cube_of(bound_of(model))
-    if crossed:
-        box, around = with_zeros(box_of(model, "aabb_train"), resolution, box)
-        resolution = tuple(n + sum(more) for n, more in zip(resolution, around, strict=True))
-        density, colour = (
-            {name: np.pad(made[name], [*(around[axis] for axis in AXES[name]), (0, 0)]) for name in made}
-            for made in (density, colour)
-        )
+    box, around = with_zeros(box_of(model, "aabb_train"), resolution, cube_of(bound_of(model)))
+    resolution = tuple(n + sum(more) for n, more in zip(resolution, around, strict=True))
+    axes = AXES if crossed else LINE_AXES
+    density, colour = (
+        {name: np.pad(made[name], [*(around[axis] for axis in axes[name]), (0, 0)]) for name in made}
+        for made in (density, colour)
+    )
     values = {f"density_{name}": value for name, value in density.items()} | sections
     values |= {f"colour_{name}": value for name, value in colour.items()} | {"rgb_basis": basis}
     part = "plane_line" if crossed else "line"
@@ -289,6 +290,11 @@ def finished(
     None where it has none."""
     bound, of_texels = bound_of(model), resolution is not None
     grids = [OccupancyGrid.full(cube_of(bound))]
+    if len(getattr(model.values.get("density_grid"), "shape", ())) == 4:
+        raise FormatError(
+            "its grid of cells is of torch-ngp of spring 2022, which scaled densities by an option that it "
+            "does not hold; train it with a later one"
+        )
     if "density_bitfield" in model.values:
         bits = np.unpackbits(model.array("density_bitfield", None).astype(np.uint8), bitorder="little")
         grids = cells_of_bits(bits.astype(bool), bound)

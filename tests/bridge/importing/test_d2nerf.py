@@ -37,6 +37,10 @@ class Model:
     alphas: tuple = (3.4, 2.0, 1.0, 0.5)
     bottleneck: bool = True
     fine: bool = True
+    alpha_code: bool = False
+    """Whether densities read the codes, and colours none."""
+    pushed: bool = False
+    """Whether points are only pushed (TranslationField)."""
 
 
 MODELS = {
@@ -50,6 +54,8 @@ MODELS = {
     "codes": Model(codes=True, identity=True),
     "other degrees": Model(degree=5, static_degree=3),
     "one network": Model(bottleneck=False, fine=False),
+    "codes of densities": Model(codes=True, alpha_code=True),
+    "points pushed": Model(pushed=True),
 }
 DEEP = {"depth": 6, "skip": 4}
 
@@ -81,7 +87,8 @@ def parameters(model: Model) -> dict:
     width, coordinates = 24, {"sheet": 3, "code": CODE, "": 0}[model.hyper]
     code = CODE if model.codes else 0
     inputs = point_width(model.degree, model.identity) + 2 * coordinates
-    seen = (directions if model.bottleneck else 0) + code
+    seen = (directions if model.bottleneck else 0) + (0 if model.alpha_code else code)
+    opaque = code if model.alpha_code else 0
 
     def embed():
         return {"embed": {"embedding": rng.normal(size=(TIMES, CODE)).astype(np.float32)}}
@@ -89,19 +96,22 @@ def parameters(model: Model) -> dict:
     dynamic = stack(rng, inputs, width, **DEEP, prefix="trunk_hidden_")
     dynamic |= {
         "MLP_0": stack(rng, width + seen, 16, 1) | {"logit": dense(rng, 16, 3)},
-        "MLP_1": {"logit": dense(rng, width, 1 + bool(model.shadow))},
+        "MLP_1": {"logit": dense(rng, width + opaque, 1 + bool(model.shadow))},
     }
     read = point_width(model.static_degree, model.identity)
     static = {
         "MLP_0": stack(rng, read, 32, **DEEP),
         "MLP_1": stack(rng, 32 + seen, 16, 1) | {"logit": dense(rng, 16, 3)},
-        "MLP_2": {"logit": dense(rng, 32, 1)},
+        "MLP_2": {"logit": dense(rng, 32 + opaque, 1)},
     }
     if model.bottleneck:
         dynamic["bottleneck"], static["bottleneck"] = dense(rng, width, width), dense(rng, 32, 32)
     level = "nerf_mlps_fine" if model.fine else "nerf_mlps_coarse"
     params = {level: dynamic, "static_nerf": {level: static}, "warp_embed": embed()}
-    if model.warp:
+    if model.pushed:
+        pushing = stack(rng, point_width(3, False) + CODE, 16, **DEEP) | {"logit": dense(rng, 16, 3)}
+        params["warp_field"] = {"mlp": pushing}
+    elif model.warp:
         params["warp_field"] = {
             "trunk": stack(rng, point_width(3, False) + CODE, 16, **DEEP),
             "branches_w": {"logit": dense(rng, 16, 3)},
@@ -180,7 +190,11 @@ def answers(model: Model, params: dict, points: np.ndarray, dirs: np.ndarray, ti
         return np.tile(mixed, (len(points), 1))
 
     code, moved = code_of(params["warp_embed"]), points
-    if model.warp:
+    if model.pushed:
+        field = params["warp_field"]["mlp"]
+        h = hidden(field, np.concatenate([posenc(points, 3, False, warp_alpha), code], 1))
+        moved = points + apply(field["logit"], h)
+    elif model.warp:
         field = params["warp_field"]
         h = hidden(field["trunk"], np.concatenate([posenc(points, 3, False, warp_alpha), code], 1))
         twists = zip(
@@ -196,13 +210,20 @@ def answers(model: Model, params: dict, points: np.ndarray, dirs: np.ndarray, ti
         features.append(posenc(code, 1, False, hyper_alpha))
     features, network = np.concatenate(features, 1), params[level]
     h = hidden(network, features, prefix="trunk_hidden_")
-    alpha = apply(network["MLP_1"]["logit"], h)
+
+    def opacity(network: dict, name: str, h: np.ndarray, code: np.ndarray) -> np.ndarray:
+        if model.alpha_code:
+            h = np.concatenate([apply(network["bottleneck"], h) if model.bottleneck else h, code], 1)
+        return apply(network[name]["logit"], h)
+
+    alpha = opacity(network, "MLP_1", h, code_of(params.get("nerf_embed")))
     seen = [posenc(dirs, 2, model.identity, None)] if model.bottleneck else []
 
     def colour(network: dict, name: str, h: np.ndarray, code: np.ndarray) -> np.ndarray:
         read = apply(network["bottleneck"], h) if model.bottleneck else h
+        codes = [] if model.alpha_code else [code]
         return sigmoid(
-            apply(network[name]["logit"], hidden(network[name], np.concatenate([read, *seen, code], 1)))
+            apply(network[name]["logit"], hidden(network[name], np.concatenate([read, *seen, *codes], 1)))
         )
 
     found = {
@@ -218,8 +239,9 @@ def answers(model: Model, params: dict, points: np.ndarray, dirs: np.ndarray, ti
         found["shadow"] = sigmoid(raw - 0.5)
     static = params["static_nerf"][level]
     h = hidden(static["MLP_0"], posenc(points, model.static_degree, model.identity, nerf_alpha))
-    found["sigma_static"] = np.log1p(np.exp(apply(static["MLP_2"]["logit"], h)[:, 0]))
-    found["rgb_static"] = colour(static, "MLP_1", h, code_of(params["static_nerf"].get("nerf_embed")))
+    code = code_of(params["static_nerf"].get("nerf_embed"))
+    found["sigma_static"] = np.log1p(np.exp(opacity(static, "MLP_2", h, code)[:, 0]))
+    found["rgb_static"] = colour(static, "MLP_1", h, code)
     return found
 
 
@@ -305,6 +327,23 @@ def test_networks_that_do_not_fit_are_refused(path, tmp_path):
         d2nerf.read(written(MODELS["as run"], tmp_path, halved(*path)), BOX, 1)
 
 
+@pytest.mark.parametrize("named", ["branches_p", "branches_t"])
+def test_pivots_are_refused(named, tmp_path):
+    def change(params):
+        params["warp_field"][named] = params["warp_field"]["branches_v"]
+
+    with pytest.raises(FormatError, match=f"{named} .* is not read; train it without"):
+        d2nerf.read(written(MODELS["as run"], tmp_path, change), BOX, 1)
+
+
+def test_weights_by_which_earlier_versions_blend_are_refused(tmp_path):
+    def change(params):
+        params["nerf_mlps_fine"]["MLP_2"] = {"logit": dense(np.random.default_rng(0), 24, 1)}
+
+    with pytest.raises(FormatError, match="blend_mode old or nsff"):
+        d2nerf.read(written(MODELS["as run"], tmp_path, change), BOX, 1)
+
+
 def test_shadows_of_other_skips_are_refused(tmp_path):
     def change(params):
         params["shadow_model"] = stack(np.random.default_rng(0), 30, 16, 6, 3, "trunk_hidden_")
@@ -323,7 +362,7 @@ hyper_point_min_deg = 0
 # Parameters for DecomposeNerfModel:
 # ==============================================================================
 DecomposeNerfModel.activation = @jax.nn.relu
-DecomposeNerfModel.blend_mode = 'add'
+DecomposeNerfModel.blend_mode = 'nsff'
 DecomposeNerfModel.hyper_point_min_deg = %hyper_point_min_deg
 DecomposeNerfModel.norm_type = 'none'
 DecomposeNerfModel.sigma_activation = \\
@@ -349,7 +388,6 @@ def test_settings_as_gin_writes_them_are_read(tmp_path):
     [
         ("Model.norm_type = 'none'", "Model.norm_type = 'layer'", "'DecomposeNerfModel.norm_type' should be"),
         ("@jax.nn.relu", "@jax.nn.elu", "'DecomposeNerfModel.activation' should be relu, found @jax.nn.elu"),
-        ("'add'", "'nsff'", "'DecomposeNerfModel.blend_mode' should be add, found nsff"),
         ("deg = 0", "deg = -1", "'hyper_point_min_deg' should be 0, found -1"),
         ("use_pivot = False", "use_pivot = True", "'SE3Field.use_pivot' should be False, found True"),
     ],

@@ -261,6 +261,15 @@ def test_instant_ngp(name, tmp_path):
     assert ("scale 0.33 and offset 0.5" in said) == (made.scale is None)
 
 
+@pytest.mark.parametrize("float32", [False, True])
+def test_parameters_of_2022_do_not_say_their_type(float32, tmp_path):
+    made = Snapshot(float32=float32)
+    root, (points, d) = root_of(made), places(made)
+    del root["snapshot"]["params_type"]
+    imported = instant_ngp.read(written(root, tmp_path))
+    oracle.assert_alike(oracle.answers(imported, points, d), expected(made, points, d))
+
+
 def test_the_command_writes_what_it_shows(tmp_path):
     made = Snapshot(aabb_scale=8, crop=(-3.0, -3.5, -2.0, 3.0, 4.5, 4.5))
     checkpoint, (points, d) = written(root_of(made), tmp_path), places(made)

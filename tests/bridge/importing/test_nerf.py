@@ -229,6 +229,22 @@ def test_a_run_in_normalised_device_coordinates_is_said_to_be(tmp_path):
         assert [note for note in notes if note != nerf.FINE] == expected
 
 
+def test_cameras_do_not_tell_a_box_in_normalised_device_coordinates(tmp_path):
+    capture(tmp_path / "fern")
+    path = save_nerf(Net(depth=2), tmp_path)
+    (tmp_path / "args.txt").write_text("dataset_type = llff\nno_ndc = False\n")
+    near_far = "--near", 2, "--far", 6, "--cameras", tmp_path / "fern"
+    said = run("import", path, "-o", tmp_path / "a.rfpack", *near_far, code=2)
+    assert "give its box there as --aabb" in " ".join(said.split())
+
+
+def test_an_encoding_that_is_not_read_is_named(tmp_path):
+    path = save_nerf(Net(depth=2), tmp_path)
+    (tmp_path / "args.txt").write_text("i_embed = 2\n")
+    with pytest.raises(FormatError, match="'i_embed = 2', an encoding that is not read"):
+        nerf.read(open_checkpoint(path), BOX)
+
+
 # -- krrish94's ----------------------------------------------------------------------------------------------
 
 
@@ -433,8 +449,10 @@ def test_hashnerfs_box_is_the_one_that_its_run_states(tmp_path):
     assert "args.txt" in report and "four digits" in report
     assert_box(tmp_path / "a.rfpack", BOX)
     (tmp_path / "args.txt").write_text("finest_res = 512\nbounding_box = None\n")
-    output = run("import", path, "-o", tmp_path / "b.rfpack", "--near", 2, "--far", 6, code=2)
+    output = run("import", path, "-o", tmp_path / "b.rfpack", code=2)
     assert "which box its hash grid fills; give it as --aabb" in " ".join(output.split())
+    output = run("import", path, "-o", tmp_path / "b.rfpack", "--near", 2, "--far", 6, code=2)
+    assert "which --near and --far do not tell" in " ".join(output.split())
 
 
 def test_a_hash_grid_without_settings_is_taken_at_their_defaults(tmp_path):

@@ -9,10 +9,12 @@ import pytest
 import torch
 
 from formats.bundle import read_summary
+from formats.captures import read_capture
 from formats.foreign.systems import open_checkpoint
 from fusedrf_cli import verbs
 from fusedrf_cli.bridge.importing import nerfacto
 from fusedrf_cli.errors import InvalidInput
+from tests.formats.test_captures import photo, posed, write
 
 from . import hash_oracle as oracle
 
@@ -43,6 +45,7 @@ class Run:
     transforms: bool = True
     marched: bool = False
     """Whether it is nerfstudio's instant-ngp."""
+    semantic: bool = False
     contraction: int | None = None
     """And if it is of before April 2023, its contraction."""
 
@@ -63,6 +66,7 @@ RUNS = {
     "before densities had a scale": Run(density=None),
     "without settings": Run(config=False, wide=(64, 64)),
     "without settings, tiny-cuda-nn": Run(tcnn=True, config=False, wide=(128, 64), layers=(1, 2)),
+    "Semantic NeRF-W without settings": Run(config=False, wide=(64, 64), semantic=True),
     "on several GPUs": Run(prefix="_model.module."),
     "wrapped whole": Run(tcnn=True, prefix="module._model."),
     "of 2023": Run(layout="between", density=None),
@@ -192,6 +196,8 @@ def state_of(run: Run) -> dict[str, np.ndarray]:
         }
     state["occupancy_grid.occs" if run.marched else "proposal_networks.0.aabb"] = BOX
     state["field.mlp_pred_normals.layers.0.weight"] = BOX
+    if run.semantic:
+        state["field.mlp_semantics.layers.0.weight"] = BOX
     state["camera_optimizer.pose_adjustment"] = np.zeros((9, 6), np.float32)
     return {run.prefix + name: value for name, value in state.items()}
 
@@ -281,7 +287,7 @@ def expected(run: Run, points: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, n
     read = np.concatenate([seen, h[:, 1:], np.tile(code, (len(h), 1))], 1)
     weights, biases = zip(*head, strict=True)
     rgb = oracle.network(filled(read, weights[0].shape[1], 1.0), *weights, biases=biases)[:, :3]
-    density = 1.0 if run.density is None else run.density
+    density = 1.0 if run.density is None or run.semantic else run.density
     return scale * density * np.exp(h[:, 0]) * inside, oracle.sigmoid(rgb)
 
 
@@ -322,6 +328,34 @@ def test_the_command_writes_it(tmp_path):
     oracle.assert_alike(oracle.asked(tmp_path / "f.rfpack", points, d), expected(run, points, d), 1e-3)
 
 
+@pytest.mark.parametrize("stated", ["all", "scale", "nothing", "what it used to be"])
+def test_what_was_done_to_the_poses_before_is_undone_by_the_capture(stated, tmp_path):
+    """nerfstudio's parser: model = f T p of the poses p in transforms.json, whose middle it puts at 0; it
+    saves T A and f s, where that file says that A and s were applied."""
+    rng = np.random.default_rng(3)
+    applied, scale = np.eye(4), 1.0
+    if stated != "nothing":
+        applied[:3] = [[0, 1, 0, 0.5], [1, 0, 0, -2], [0, 0, -1, 1]] if stated == "all" else np.eye(4)[:3]
+        scale = 2.5 if stated in ("all", "scale") else 1.0
+    keys = {"applied_transform": applied[:3].tolist()} if stated == "all" else {}
+    keys |= {"applied_scale": scale} if stated in ("all", "scale") else {}
+    if stated == "what it used to be":
+        (tmp_path / "capture/colmap/sparse/0").mkdir(parents=True)
+        applied[:3] = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, 3] = rng.normal(size=(6, 3)) + [4, 5, 6]
+    photo(tmp_path / "capture/a.png")
+    write(tmp_path / "capture", frames=posed(tmp_path / "capture", poses.tolist()), fl_x=80, **keys)
+    turned, size = np.eye(4), 0.3
+    turned[:3, :3] = FRAME
+    turned[:3, 3] = -FRAME @ poses[:, :3, 3].mean(0)
+    saved = {"transform": (turned @ applied)[:3].tolist(), "scale": size * scale}
+    placement, _ = nerfacto.placement_of(saved, read_capture(tmp_path / "capture"))
+    points = np.concatenate([rng.normal(size=(5, 3)), np.ones((5, 1))], 1)
+    model = points @ (np.diag([size] * 3 + [1]) @ turned).T
+    np.testing.assert_allclose(model @ placement.T, points, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("run", "changed", "said"),
     [
@@ -336,6 +370,8 @@ def test_the_command_writes_it(tmp_path):
         (Run(contracted=False), {"aabb": np.zeros((2, 3))}, "three minima below three maxima"),
         (NGP, {}, "should be 2, of a ball, or 0, of a box, found 1"),
         (replace(NGP, contraction=2), {"aabb": BOX}, "the box in a contracted scene should be a cube"),
+        (Run(), {"mlp_base.model.0.hash_table": None}, "another method's of nerfstudio than nerfacto's"),
+        (Run(tcnn=True, config=False), {"mlp_base.model.params": np.zeros(99)}, "config.yml beside it"),
         (Run(density=-1.0), {}, "'average_init_density' should be above 0, found -1"),
     ],
 )  # fmt: skip

@@ -275,6 +275,11 @@ def test_a_forward_facing_scene_is_said_to_lie_in_ndc(tmp_path):
     (tmp_path / "args.json").write_text('{"dataset_type": "llff", "near_clip": 0.0}')
     imported = svox2.read(write(tmp_path / "ckpt.npz", entries_of(SAVED["harmonics"])))
     assert "NDC" in imported.notes[0]
+    box = {"radius": np.array([1.4, 1.1, 1.0], np.float32), "center": np.zeros(3, np.float32)}
+    for said, notes in (("auto", 1), ("nsvf", 0)):  # by its box, unless the run says otherwise
+        (tmp_path / "args.json").write_text(f'{{"dataset_type": "{said}"}}')
+        imported = svox2.read(write(tmp_path / "ckpt.npz", entries_of(SAVED["harmonics"]) | box))
+        assert len(imported.notes) == notes
 
 
 def test_nothing_dense_is_an_empty_field(tmp_path):

@@ -65,6 +65,7 @@ MODELS = {
     "tiny-cuda-nn": Model(levels=16, log2_rows=19, networks="tcnn"),
     "TensoRF": Model("vm", frequencies=2),
     "TensoRF's lines": Model("cp", bound=2),
+    "TensoRF's lines, shrunk": Model("cp", trained=(-0.75, -1.0, -0.5, 1.0, 0.75, 1.0)),
 }
 PVD = {
     "hash": Model(levels=14),
@@ -305,6 +306,12 @@ def test_pvd(name, tmp_path):
     found = oracle.answers(imported, points, d)
     oracle.assert_alike(found, expected(model, state_of(model, True), points, d, True))
     assert any("between -2 and 7" in note for note in imported.notes) == (not model.args)
+
+
+def test_cells_of_spring_2022_are_refused(tmp_path):
+    grid = np.zeros((1, SIDE, SIDE, SIDE), np.float32)
+    with pytest.raises(FormatError, match="spring 2022.*train it with a later one"):
+        torch_ngp.read(written(Model(), tmp_path, density_grid=grid))
 
 
 def test_limits_of_pvd_that_are_none_are_named(tmp_path):

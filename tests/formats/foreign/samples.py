@@ -84,6 +84,18 @@ TORCH: dict[str, tuple[str, object]] = {
     ),
     "dvgo": ("fine_last.tar", dvgo()),
     "dcvgo": ("fine_last.tar", dvgo(scene_center=weights(3), scene_radius=weights(3))),
+    "dbivoxgo": (
+        "fine_last.tar",
+        {
+            "model_kwargs": {},
+            "model_state_dict": state("scene_radius", "density.0.grid", "density.1.grid", "k0.0.grid"),
+        },
+    ),
+    "ccnerf": ("hotdog.th", {"kwargs": {"degree": 3}, "state_dict": state("S_vec.0", "sigma_vec.0")}),
+    "d-nerf": (
+        "000200.tar",
+        {"network_fn_state_dict": state("_occ.pts_linears.0.weight", "_time.0.weight")},
+    ),
     "dmpigo": ("fine_last.tar", dvgo(act_shift=weights(1, 1, 1, 1, 4))),
     "nerf-pytorch": (
         "000200.tar",

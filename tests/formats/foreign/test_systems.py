@@ -202,6 +202,10 @@ def test_versions_and_modes_of_snapshots(tmp_path):
     path.write_bytes(msgpack.packb(content))
     with pytest.raises(UnknownCheckpoint, match="'sdf', expected nerf"):
         open_checkpoint(path)
+    del content["snapshot"]["mode"]
+    path.write_bytes(msgpack.packb(content))
+    with pytest.raises(UnknownCheckpoint, match="without a radiance field"):
+        open_checkpoint(path)
 
 
 def test_folders_without_checkpoints_and_pipes_are_refused(tmp_path):
@@ -238,10 +242,6 @@ def test_damaged_checkpoints_are_refused_or_read(system, tmp_path):
     [
         (lambda table: table["state_dict"], "kwargs, state_dict/density_line.0, state_dict/app_line.0"),
         (lambda table: {"model": table}, "kwargs, state_dict/density_line.0, state_dict/app_line.0"),
-        (
-            lambda table: table | {"state_dict": {f"module.{k}": v for k, v in table["state_dict"].items()}},
-            "state_dict/density_line.0, state_dict/app_line.0",
-        ),
     ],
 )
 def test_arrays_that_lie_elsewhere_are_said_to_be_a_systems(tmp_path, entries, lacking):
@@ -251,6 +251,25 @@ def test_arrays_that_lie_elsewhere_are_said_to_be_a_systems(tmp_path, entries, l
         UnknownCheckpoint, match=f"as TensoRF names them, but {re.escape(lacking)} lack: give"
     ):
         open_checkpoint(tmp_path / "a.th")
+
+
+@pytest.mark.parametrize("prefix", ["module.", "_orig_mod.", "module._orig_mod."])
+def test_names_of_a_model_on_several_gpus_or_compiled(prefix, tmp_path):
+    path = write("torch-ngp", tmp_path)
+    table = torch.load(path, weights_only=False)
+    plain = [*table["model"]]
+    table["model"] = {prefix + name: value for name, value in table["model"].items()}
+    torch.save(table, path)
+    checkpoint = open_checkpoint(path)
+    assert checkpoint.system == "torch-ngp" and [*checkpoint.entries["model"]] == plain
+
+
+def test_names_of_checkpoints_may_end_twice(tmp_path):
+    path = write("torch-ngp", tmp_path)
+    for step in (1, 3, 20):
+        shutil.copy(path, tmp_path / f"ngp_ep{step:04d}.pth.pth")
+    path.unlink()
+    assert open_checkpoint(tmp_path).path.name == "ngp_ep0020.pth.pth"
 
 
 def test_a_scene_that_moves_is_not_said_to_lack_anything(tmp_path):

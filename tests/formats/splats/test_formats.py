@@ -7,6 +7,7 @@ import pytest
 
 from formats.errors import BadSplats
 from formats.splats.reading import is_splats, read_splats
+from formats.splats.spz import UNSTATED
 from tests.formats.splats import writers
 from tests.formats.splats.writers import content, written
 
@@ -101,7 +102,7 @@ def test_one_content_in_every_format(name, tmp_path):
     assert is_splats(path)
     splats = read_splats(path)
     check(splats, expected, bounds)
-    assert splats.notes == ()
+    assert [*splats.notes] == [f"{path}: {UNSTATED}"] * name.startswith("spz")
     assert splats.up == (0, -1, 0)
 
 
@@ -147,6 +148,11 @@ def test_other_files_are_no_splats(data, tmp_path):
             "a quantised .ply of Reduced-3DGS",
         ),
         (writers.ply(content()).replace(b"f_rest_0\n", b"f_anchor_feat_0\n"), "a .ply of Scaffold-GS"),
+        (writers.ply(content()).replace(b"f_rest_0\n", b"trbf_center\n"), "a .ply of Spacetime Gaussians"),
+        (
+            b'{"means": {"shape": [9, 3], "dtype": "float32"}, "quats": {}, "opacities": {}, "sh0": {}}',
+            "the meta.json of gsplat's PNG compression",
+        ),
     ],
 )
 def test_known_formats_that_are_not_read(data, sentence, tmp_path):

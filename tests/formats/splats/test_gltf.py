@@ -173,6 +173,22 @@ def test_scales_of_drafts_are_logarithms(tmp_path):
     assert "scales are logarithms" in splats.notes[0]
 
 
+def test_one_colour_for_each_splat_as_the_first_draft_had_it(tmp_path):
+    expected = content(5, 0)
+    made = gltf(expected)
+    attributes = made.primitive["attributes"]
+    for name in ("ROTATION", "SCALE"):
+        attributes[f"_{name}"] = attributes.pop(f"{SPLATTING}:{name}")
+    for name in ("OPACITY", "SH_DEGREE_0_COEF_0"):
+        del attributes[f"{SPLATTING}:{name}"]
+    colours = 0.5 + 0.28209479177387814 * expected.harmonics[:, 0]
+    rgba = np.concatenate([colours, expected.opacities[:, None]], 1)
+    attributes["COLOR_0"] = made.accessor(rgba.astype(np.float32))
+    splats = read(tmp_path, made)
+    check(splats, expected, EXACT)
+    assert "one colour for each splat" in splats.notes[0]
+
+
 def test_what_is_not_honoured_is_told(tmp_path):
     made = gltf(content(5, 0))
     made.primitive["extensions"][SPLATTING] |= {"colorSpace": "lin_rec709_display", "kernel": "box"}

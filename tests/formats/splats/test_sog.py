@@ -77,6 +77,11 @@ def test_how_it_was_trained_is_told(model, word, tmp_path):
     assert word in read(tmp_path, changed(sog_files(content()), model=model)).notes[0]
 
 
+def test_antialiasing_as_playcanvas_states_it(tmp_path):
+    assert "antialiasing" in read(tmp_path, changed(sog_files(content()), antialias=True)).notes[0]
+    assert read(tmp_path, changed(sog_files(content()), antialias=False)).notes == ()
+
+
 def test_splats_that_move_are_refused(tmp_path):
     """SplatTransform's .sogst, whose still part is a SOG byte for byte."""
     with pytest.raises(BadSplats, match="the format 'sogst', and only SOGs that stand still"):

@@ -1,6 +1,7 @@
 """The `dense-mlp` field: a grid of vertices with density and features, and a small decoder of colours, its
 own or one that it shares with other fields (Control-NeRF, Lazova et al., WACV 2023)."""
 
+import math
 from dataclasses import dataclass
 
 from fusedrf_cli.engine.decoders import density_sum, sh_mlp
@@ -34,6 +35,16 @@ class DenseMLPShape:
     def __post_init__(self):
         """Refuse what the kernels were not written for: runs of eight numbers."""
         check_counts(self, {"width": (8, 64, 8), "hidden": (8, 128, 8)})
+
+    @property
+    def sh_degree(self) -> int:
+        """Of the spherical harmonics that features have room for."""
+        return min(3, math.isqrt(self.width // 3) - 1)
+
+    @property
+    def numbers(self) -> int:
+        """Of their coefficients."""
+        return 3 * (self.sh_degree + 1) ** 2
 
 
 class DenseMLPField(DenseField):
