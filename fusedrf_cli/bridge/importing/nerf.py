@@ -31,6 +31,7 @@ from fusedrf_cli.engine.kinds.assembled.field import PartsShape
 SAMPLES = 256
 """Vertices along the longest side by which rays are sampled."""
 BASE, FINEST = 16, 512  # vertices of HashNeRF's coarsest grid, and of the finest where nothing is said
+FIRST_PRIMES = 73856093, 19349663, 83492791
 FINE = "of its coarse and fine networks the fine one is taken"
 NDC = (
     "its frame is that of the normalised device coordinates that it was trained in; its colours read the "
@@ -54,14 +55,9 @@ def read(checkpoint, box: np.ndarray) -> Imported:
     if "output_linear.weight" in state.values:
         sigma, rgb, sections = without_directions(layers, state.layer("output_linear"), encoding, False)
         return finished(encoding, sigma, rgb, sections, box, notes)
-    feature = state.layer("feature_linear")
-    out = stacked(state.layer("alpha_linear"), feature)
-    sigma, sections = skipping([*layers, out], encoding["count"], hidden_first=False)
-    network, count = [*state.layers("views_linears."), state.layer("rgb_linear")], len(feature[0])
-    order, columns = seen(sigma["outputs"], count, network[0][0].shape[1] - count)
-    columns = np.concatenate([order.at("features")[1:], columns])
-    rgb, colours = colour_network(network, order, columns)
-    return finished(encoding, sigma, rgb, sections | colours, box, notes)
+    out = stacked(state.layer("alpha_linear"), state.layer("feature_linear"))
+    network = [*state.layers("views_linears."), state.layer("rgb_linear")]
+    return finished(encoding, *with_directions([*layers, out], network, encoding), box, notes)
 
 
 def read_krrish(checkpoint, box: np.ndarray) -> Imported:
@@ -70,10 +66,12 @@ def read_krrish(checkpoint, box: np.ndarray) -> Imported:
     check_sampling(checkpoint)
     state, notes = network_of(checkpoint, "model_coarse_state_dict", "model_fine_state_dict")
     check_biases(state)
-    if not {"layer1.weight", "layers_xyz.0.weight"} <= set(state.values):
+    if "layer1.weight" not in state.values:
+        return finished(*paper(state), box, notes)
+    if "layers_xyz.0.weight" not in state.values:
         raise FormatError(
-            "its network is no FlexibleNeRFModel, the only one of these that is read; train it with 'type: "
-            "FlexibleNeRFModel'"
+            "its network is neither a FlexibleNeRFModel nor a PaperNeRFModel, which are read; train it with "
+            "'type: FlexibleNeRFModel'"
         )
     first, layers = state.layer("layer1"), state.layers("layers_xyz.")
     inputs, hidden = first[0].shape[1], len(layers[-1][0])
@@ -95,6 +93,18 @@ def read_krrish(checkpoint, box: np.ndarray) -> Imported:
     return finished(encoding, sigma, rgb, sections | colours, box, notes)
 
 
+def paper(state: Entries) -> tuple[dict, dict, dict, dict[str, np.ndarray]]:
+    """The entries of encoding, sigma and rgb of a PaperNeRFModel, and its sections: the density is made of
+    the features, which have no activation, and the last of its layers of colours is not used."""
+    layers, feature = state.layers("layers_xyz."), state.layer("fc_feat")
+    inputs = layers[0][0].shape[1]
+    if inputs and inputs % 6 == 0:
+        layers, inputs = with_point(layers, inputs, hidden_first=False), inputs + 3
+    out = stacked(joined(feature, state.layer("fc_alpha")), feature)
+    network, encoding = [*state.layers("layers_dir.")[:3], state.layer("fc_rgb")], encoding_of(inputs)
+    return encoding, *with_directions([*layers, out], network, encoding)
+
+
 def passing(feature: Layer, first: Layer, hidden: int, directions: int) -> list[Layer]:
     """A rectified layer of features that a direction, so many numbers e behind `hidden` others, passes as
     max(0, e) and max(0, -e), and the layer that reads both."""
@@ -114,6 +124,7 @@ def read_hashed(checkpoint, box: np.ndarray) -> Imported:
     tables = Entries(checkpoint.entries).inside("embed_fn_state_dict")
     names = [f"embeddings.{level}.weight" for level in range(max(len(tables.values), 1))]
     first = tables.array(names[0], None, None)
+    check_hash(first)
     rows = np.concatenate([tables.array(name, *first.shape) for name in names])
     settings = Entries(checkpoint.beside.get("args.txt", {}))
     finest = settings.whole("finest_res", 1, 1 << 20, FINEST)
@@ -142,6 +153,22 @@ def hashed_levels(count: int, rows: int, finest: int) -> list[dict[str, Any]]:
         {"scale": float(side), "side": side + 2, "rows": rows, "hashed": True, "offset": 0.0}
         for side in sides
     ]
+
+
+def check_hash(rows: np.ndarray) -> None:
+    """Raise FormatError where the rows (R, features) of the coarsest level that have learnt are those that
+    HashNeRF's first hash finds, and not those of the later one: others are at most 1e-4, as they began."""
+    vertices = np.indices((BASE + 1,) * 3).reshape(3, -1)
+    learnt = np.flatnonzero(np.abs(rows).max(1) > 1.0001e-4)
+    now, first = (
+        np.isin(learnt, np.bitwise_xor.reduce(vertices * np.array(primes)[:, None], 0) % len(rows)).all()
+        for primes in ((1, 2654435761, 805459861), FIRST_PRIMES)
+    )
+    if first and not now:
+        raise FormatError(
+            f"its rows are those of HashNeRF's first hash {FIRST_PRIMES}, which is not read; train it with "
+            "HashNeRF as it is published"
+        )
 
 
 def hashed_box(checkpoint) -> np.ndarray | None:
@@ -188,6 +215,19 @@ def check_sampling(checkpoint) -> None:
                 f"config.yml beside it says 'log_sampling_{name}: false', and frequencies that are evenly "
                 "spaced are not taken over; train it with 'true'"
             )
+
+
+def with_directions(
+    layers: Sequence[Layer], network: Sequence[Layer], encoding: dict[str, Any]
+) -> tuple[dict, dict, dict[str, np.ndarray]]:
+    """The entries and the sections of a trunk that makes the density and features, in this order, and of a
+    colour network that reads these and the direction."""
+    sigma, sections = skipping(layers, encoding["count"], hidden_first=False)
+    count = len(layers[-1][0]) - 1
+    order, columns = seen(sigma["outputs"], count, network[0][0].shape[1] - count)
+    columns = np.concatenate([order.at("features")[1:], columns])
+    rgb, colours = colour_network(network, order, columns)
+    return sigma, rgb, sections | colours
 
 
 def without_directions(
@@ -246,14 +286,14 @@ def seen(width: int, features: int, directions: int) -> tuple[ColourInput, np.nd
     return order, waves if bare else np.concatenate([order.at("direction"), waves])
 
 
-def with_point(layers: Sequence[Layer], inputs: int) -> list[Layer]:
-    """Layers that read the sines and cosines of a point, behind what the layer before made, as ones that read
-    it itself before them."""
+def with_point(layers: Sequence[Layer], inputs: int, hidden_first: bool = True) -> list[Layer]:
+    """Layers that read the sines and cosines of a point, behind or before what the layer before made, as ones
+    that read it itself before them."""
     widened = []
     for i, (weight, bias) in enumerate(layers):
         made = len(layers[i - 1][0]) if i else 0
-        reads = weight.shape[1] == made + inputs
-        widened.append((np.insert(weight, [made] * 3, 0, 1) if reads else weight, bias))
+        at, reads = made * hidden_first, weight.shape[1] == made + inputs
+        widened.append((np.insert(weight, [at] * 3, 0, 1) if reads else weight, bias))
     return widened
 
 

@@ -325,6 +325,36 @@ def test_a_network_answers_as_krrish94s(model, tmp_path):
     assert_equal(answers(imported.nodes[0], points, dirs), (rectified(sigma) * inside(points), rgb))
 
 
+@pytest.mark.parametrize("itself", [True, False])
+def test_a_network_answers_as_krrish94s_of_the_paper(itself, tmp_path):
+    """PaperNeRFModel.forward: density of the features, which are not rectified; three of four layers of
+    colours."""
+    state, w, read = OrderedDict(), 16, 3 * itself + 6 * 4
+    for i in range(8):
+        layer(state, f"layers_xyz.{i}", (read if i in (0, 4) else 0) + (w if i else 0), w)
+    for i in range(4):
+        layer(state, f"layers_dir.{i}", w + 3 * itself + 6 * 2 if i == 0 else 8, 8)
+    for name, inputs, outputs in (("alpha", w, 1), ("rgb", 8, 3), ("feat", w, w)):
+        layer(state, f"fc_{name}", inputs, outputs)
+
+    def raw(model, state, points, dirs):
+        h = x = encoded(points, 4, itself)
+        for i in range(8):
+            h = rectified(dense(state, f"layers_xyz.{i}", np.concatenate([x, h], 1) if i == 4 else h))
+        features = dense(state, "fc_feat", h)
+        seen = np.concatenate([features, encoded(dirs, 2, itself)], 1)
+        for i in range(3):
+            seen = rectified(dense(state, f"layers_dir.{i}", seen))
+        return dense(state, "fc_alpha", features)[:, 0], sigmoid(dense(state, "fc_rgb", seen))
+
+    centred(state, "fc_alpha", raw, None)
+    torch.save({"iter": 9, "model_coarse_state_dict": state}, tmp_path / "checkpoint00009.ckpt")
+    imported = nerf.read_krrish(open_checkpoint(tmp_path / "checkpoint00009.ckpt"), BOX)
+    points, dirs = points_around(), directions(300)
+    sigma, rgb = raw(None, state, points, dirs)
+    assert_equal(answers(imported.nodes[0], points, dirs), (rectified(sigma) * inside(points), rgb))
+
+
 def test_frequencies_that_are_evenly_spaced_are_refused(tmp_path):
     (tmp_path / "config.yml").write_text("models: {coarse: {log_sampling_xyz: false}}\n")
     with pytest.raises(FormatError, match="'log_sampling_xyz: false'.* not taken over"):
@@ -435,6 +465,23 @@ def test_a_network_answers_as_hashnerf(model, tmp_path):
     imported = nerf.read_hashed(open_checkpoint(save_hashed(model, tmp_path)), BOX)
     sigma, rgb = hashed_raw(model, points, dirs)
     assert_equal(answers(imported.nodes[0], points, dirs), (rectified(sigma) * inside(points), rgb))
+
+
+@pytest.mark.parametrize("primes", [(73856093, 19349663, 83492791), (1, 2654435761, 805459861)])
+def test_rows_of_hashnerfs_first_hash_are_refused(primes, tmp_path):
+    """What has learnt are rows that some vertex of the coarsest level asks."""
+    path = save_hashed(Hashed(log2_rows=15), tmp_path)
+    table = torch.load(path)
+    rows = torch.full((1 << 15, 2), 5e-5)
+    for i, j, k in np.ndindex(17, 17, 17):
+        rows[(i * primes[0] ^ j * primes[1] ^ k * primes[2]) & 0x7FFF] = 0.3
+    table["embed_fn_state_dict"]["embeddings.0.weight"] = rows
+    torch.save(table, path)
+    if primes[0] == 1:
+        assert nerf.read_hashed(open_checkpoint(path), BOX).nodes
+    else:
+        with pytest.raises(FormatError, match="HashNeRF's first hash"):
+            nerf.read_hashed(open_checkpoint(path), BOX)
 
 
 STATED = (
