@@ -28,6 +28,7 @@ from formats.views import Capture, View
 
 BLENDER_FILE = re.compile(r"transforms_(train|val|test)\.json")
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
+IDENTITY = np.eye(4)[:3]
 MAX_PROJECTED = 20_000
 """At most so many points are projected into each view."""
 AGREEING = 0.95
@@ -280,8 +281,8 @@ def _agrees(points: SparsePoints, seen: Mapping[str, np.ndarray], views: tuple[V
 class Applied:
     """What nerfstudio did to the poses of a capture before it wrote them."""
 
-    matrix: np.ndarray
-    """(3, 4) applied to the world in which they were estimated, ..."""
+    matrix: np.ndarray | None
+    """(3, 4) applied to the world in which they were estimated, None: not stated, ..."""
     scale: float
     """... and then their scale."""
 
@@ -300,13 +301,17 @@ def applied_to(capture: Capture) -> Applied | None:
 def _applied(path: Path, document: dict) -> Applied:
     """What a file says was done to its poses."""
     try:
-        matrix = np.array(document.get("applied_transform", np.eye(4)), np.float64).reshape(-1, 4)[:3]
+        matrix = np.array(document.get("applied_transform", IDENTITY), np.float64).reshape(-1, 4)[:3]
         scale = float(document.get("applied_scale", 1.0))
     except (TypeError, ValueError, OverflowError):
         matrix, scale = np.empty(0), 1.0
-    if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or not 0 < scale < 1e12:
-        raise BadSchema(f"{path}: expected applied_transform to be a 3x4 matrix, and applied_scale positive")
-    return Applied(matrix, scale)
+    known = matrix.shape == (3, 4) and np.isfinite(matrix).all()
+    if not known or not abs(np.linalg.det(matrix[:, :3])) > 1e-30 or not 0 < scale < 1e12:
+        raise BadSchema(
+            f"{path}: expected applied_transform to be a 3x4 matrix that can be undone, and applied_scale "
+            "positive; write it again"
+        )
+    return Applied(matrix if "applied_transform" in document else None, scale)
 
 
 def _sample(points: SparsePoints) -> np.ndarray:

@@ -37,7 +37,7 @@ MAX_FILES = 2000
 MAX_TRIED = 50
 MAX_NAMES = 50_000
 """Names of a checkpoint that its system is told by."""
-WRAPPERS = "module.", "_orig_mod."
+WRAPPERS = "module.", "_orig_mod.", "module."
 """In front of the names of a wrapped model's numbers."""
 CAPTURED = (
     "active_sh_degree", "_xyz", "_features_dc", "_features_rest", "_scaling", "_rotation", "_opacity",
@@ -111,7 +111,7 @@ def known_systems() -> str:
 def _likeness(names: list[str]) -> str:
     """Of names that lie elsewhere in a system's own files, what they should be; "" of any others."""
     last = [name.rpartition("/")[2].removeprefix("module.") for name in names]
-    for system in SYSTEMS.values():
+    for system in (system for system in SYSTEMS.values() if system.is_read):
         for words in system.rule.split("|"):
             wanted = [word for word in words.split() if not word.startswith("!")]
             inner = [word.rpartition("/")[2] for word in wanted if "/" in word]
@@ -158,11 +158,11 @@ def _unwrapped(entries: dict, levels: int = 3) -> dict:
     compiled."""
     if levels == 0:
         return entries
-    for prefix in WRAPPERS:
-        if entries and all(isinstance(name, str) and name.startswith(prefix) for name in entries):
-            entries = {name.removeprefix(prefix): value for name, value in entries.items()}
+    wrapped = (prefix for prefix in WRAPPERS if all(str(name).startswith(prefix) for name in entries))
+    while entries and (prefix := next(wrapped, None)):
+        entries = {str(name).removeprefix(prefix): value for name, value in entries.items()}
     return {
-        name: _unwrapped(value, levels - 1) if type(value) is dict else value
+        name: _unwrapped(value, levels - 1) if isinstance(value, dict) else value
         for name, value in entries.items()
     }
 
@@ -271,7 +271,8 @@ SYSTEMS = {  # the first whose rule fits counts
     ),
     "ccnerf": System(
         "CCNeRF's own code",
-        "kwargs:* state_dict/S_vec.0:* | kwargs:* state_dict/S_mat.0:*",
+        "kwargs:* state_dict/S_vec.0:* state_dict/sigma_*:* | kwargs:* state_dict/S_mat.0:* "
+        "state_dict/sigma_*:*",
         is_read=False,
     ),
     "svox2": System("Plenoxels (svox2)", "links:* density_data:* sh_data:* | links:* data:*", ("args.json",)),
@@ -302,7 +303,8 @@ SYSTEMS = {  # the first whose rule fits counts
     "nerf-pytorch": System("nerf-pytorch", "network_fn_state_dict/pts_linears.0.weight:*", ("args.txt",)),
     "krrish-nerf": System(
         "krrish94's nerf-pytorch",
-        "model_coarse_state_dict/layer1.weight:* | model_coarse_state_dict/layers_xyz.0.weight:*",
+        "model_coarse_state_dict/layer1.weight:* "
+        "| model_coarse_state_dict/layers_xyz.0.weight:* !latent_codes:*",  # which NerFACE has
         ("config.yml",),
     ),
     "pvd": System(  # its hash grid has 14 levels, where torch-ngp's has 16

@@ -103,11 +103,13 @@ def newest_point_cloud(folder: Path | str) -> Path | None:
     return next((place for place in places if place.is_file() and is_splats(place)), None)
 
 
-def is_moved(folder: Path | str, newest: Path) -> bool:
-    """Whether the newest splats of a run are moved by a network beside them, as 4DGaussians' and those of
+def is_moved(path: Path) -> bool:
+    """Whether the splats of a run are moved by a network beside them, as 4DGaussians' and those of
     Deformable-3DGS are."""
-    beside = newest.with_name("deformation.pth").is_file()
-    return beside or any(Path(folder).glob("deform/iteration_*/deform.pth"))
+    if path.with_name("deformation.pth").is_file():
+        return True
+    in_run = path.parent.name.startswith("iteration_") and len(path.parents) > 2
+    return in_run and any(islice(path.parents[2].glob("deform/iteration_*/deform.pth"), 1))
 
 
 @np.errstate(all="ignore")

@@ -671,7 +671,7 @@ def test_points_that_are_not_there(tmp_path):
     assert capture.points is None and "p.ply" in capture.notes[0]
 
 
-@pytest.mark.parametrize("matrix, scale", [([[1, 2], [3, 4]], 1), (MOVED, 0), ("x", 1)])
+@pytest.mark.parametrize("matrix, scale", [([[1, 2], [3, 4]], 1), (MOVED, 0), ("x", 1), ([[0.0] * 4] * 3, 1)])
 def test_bad_applied_transform(tmp_path, matrix, scale):
     photo(tmp_path / "a.png")
     cloud(tmp_path / "p.ply")

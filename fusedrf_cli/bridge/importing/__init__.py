@@ -77,7 +77,7 @@ def import_field(request: ImportRequest, progress) -> dict:
         check_boxless(request)
         system, imported = "Gaussian splats", splats.read(newest or request.path, memory)
         taken = [] if newest is None else [f"{request.path}: its newest splats are taken, {newest}"]
-        if newest is not None and is_moved(request.path, newest):
+        if is_moved(Path(newest or request.path)):
             taken.append(
                 f"{request.path}: its splats move, by a network that is not read; they stand where they rest"
             )
@@ -186,15 +186,15 @@ def box_of(request: ImportRequest, capture: Capture | None, checkpoint: Checkpoi
                 "xmin,ymin,zmin,xmax,ymax,zmax, exactly as its run had it"
             )
         return stated
-    if capture is None or request.near is None or request.far is None:
-        raise UsageProblem(
-            f"{request.path} does not say where its scene lies; give the box as --aabb "
-            "xmin,ymin,zmin,xmax,ymax,zmax, or --near, --far and the capture as --cameras"
-        )
     if nerf.in_ndc(checkpoint):
         raise UsageProblem(
             f"{request.path} was trained in normalised device coordinates, in which a capture's cameras do "
             "not lie; give its box there as --aabb, such as -1.5,-1.67,-1,1.5,1.67,1"
+        )
+    if capture is None or request.near is None or request.far is None:
+        raise UsageProblem(
+            f"{request.path} does not say where its scene lies; give the box as --aabb "
+            "xmin,ymin,zmin,xmax,ymax,zmax, or --near, --far and the capture as --cameras"
         )
     if not request.near < request.far:
         raise UsageProblem(f"--near {request.near:g} should be less than --far {request.far:g}")

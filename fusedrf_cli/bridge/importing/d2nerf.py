@@ -55,6 +55,11 @@ class Model:
         self.state = entries.inside("optimizer").inside("target").inside("model")
         self.entries, self.beside = entries, checkpoint.beside
         self.level = "nerf_mlps_fine" if "nerf_mlps_fine" in self.state.values else "nerf_mlps_coarse"
+        if "MLP_2" in self.state.inside(self.level).values:
+            raise FormatError(
+                "its moving part has a weight by which it is blended (blend_mode old or nsff of earlier "
+                "versions), which is not read; train it with 'add'"
+            )
         self.static = self.state.inside("static_nerf").inside(self.level)
         self.static_layers = layers_of(self.static.inside("MLP_0"))
         self.count, self.identity = frequencies_of(self.static_layers[0][0].shape[1])
@@ -145,11 +150,6 @@ class Dynamic:
 
     def __init__(self, model: Model, time: float):
         self.model, self.state, self.network = model, model.state, model.state.inside(model.level)
-        if "MLP_2" in self.network.values:
-            raise FormatError(
-                "its moving part has a weight by which it is blended (blend_mode old or nsff of earlier "
-                "versions), which is not read; train it with 'add'"
-            )
         self.time, self.warp_code = time, model.code("warp_embed", time)
         own = model.code("hyper_embed", time)
         self.hyper_code = own if len(own) else self.warp_code
@@ -169,6 +169,8 @@ class Dynamic:
         if "mlp" in place.values:  # points are only pushed
             network = place.inside("mlp")
             weight, bias = layer_of(network, "logit")
+            if len(weight) != TWIST // 2:
+                raise FormatError(f"{network.where}'logit' should make 3 numbers, found {len(weight)}")
             still = np.zeros_like(weight), None if bias is None else np.zeros_like(bias)
             last = stacked(still, (weight, bias))
             return self.moving(layers_of(network), last, alpha, self.warp_code, prefix)

@@ -158,6 +158,8 @@ def hashed_levels(count: int, rows: int, finest: int) -> list[dict[str, Any]]:
 def check_hash(rows: np.ndarray) -> None:
     """Raise FormatError where the rows (R, features) of the coarsest level that have learnt are those that
     HashNeRF's first hash finds, and not those of the later one: others are at most 1e-4, as they began."""
+    if not rows.size:
+        raise FormatError("'embeddings.0.weight' should hold rows of numbers, found none")
     vertices = np.indices((BASE + 1,) * 3).reshape(3, -1)
     learnt = np.flatnonzero(np.abs(rows).max(1) > 1.0001e-4)
     now, first = (

@@ -42,7 +42,8 @@ DEPTHS = 1, 2, 3, 4, 5, 6, 0  # hidden layers that networks may have beside the 
 MOST_SAMPLES = 512  # vertices along an axis by which rays are sampled
 DENSITY = 0.01  # average_init_density of the recipe
 SEMANTIC = "mlp_semantics", "field_head_semantics"
-"""In front of the names of what Semantic NeRF-W has beside: its densities begin at 1."""
+"""In front of the names of what Semantic NeRF-W has beside: its densities begin at 1, whatever its settings
+say."""
 CONVERTED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """What was done to the poses of COLMAP before captures said so."""
 OWN_ARRAYS = "mlp_base.params", "mlp_base.model.params", "mlp_base_mlp.tcnn_encoding.params"
@@ -127,13 +128,14 @@ def model_settings(config: Any) -> Mapping[str, Any]:
 def density_of(state: Entries, settings: Entries, marched: bool) -> tuple[float, list[str]]:
     """What densities are multiplied by, and notes. It is 1 where settings do not know it, as of versions
     before that setting, and of models that have none."""
+    if any(name.startswith(SEMANTIC) for name in state.values):
+        return 1.0, []
     if settings.values:
         scale = settings.number("average_init_density", 1.0)
         if not scale > 0:
             raise FormatError(f"config.yml: 'average_init_density' should be above 0, found {scale:g}")
         return scale, []
     before = marched or not {"mlp_base.model.params", "mlp_base.model.0.hash_table"} & set(state.values)
-    before |= any(name.startswith(SEMANTIC) for name in state.values)
     scale = 1.0 if before else DENSITY
     shown = "none" if marched else "the mean"
     return scale, [
@@ -355,17 +357,20 @@ def placement_of(transforms: Any, capture: Capture | None = None) -> tuple[np.nd
     said = "it lies where its capture does: dataparser_transforms.json is undone"
     if capture is None:
         said += "; where its transforms.json has an applied_transform, --cameras undoes that as well"
+    if len(placements) > 1:
+        said += "; whether its poses were turned before, their middle tells"
     return min(placements, key=lambda placement: off_centre(placement, capture)), [said]
 
 
 def applied_in(capture: Capture) -> list[Applied]:
     """What nerfstudio may have taken for what was done to the poses of a capture: what its file says, else
     nothing, or since 2023 what its own converter used to do."""
-    if (stated := applied_to(capture)) is not None:
+    stated = applied_to(capture) or Applied(None, 1.0)
+    if stated.matrix is not None:
         return [stated]
     folder = capture.path if capture.path.is_dir() else capture.path.parent
-    converted = [Applied(CONVERTED, 1.0)] if (folder / "colmap/sparse/0").is_dir() else []
-    return [Applied(np.eye(4)[:3], 1.0), *converted]
+    converted = [CONVERTED] if (folder / "colmap/sparse/0").is_dir() else []
+    return [Applied(matrix, stated.scale) for matrix in (np.eye(4)[:3], *converted)]
 
 
 def off_centre(placement: np.ndarray, capture: Capture | None) -> float:

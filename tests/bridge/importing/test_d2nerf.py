@@ -56,6 +56,7 @@ MODELS = {
     "one network": Model(bottleneck=False, fine=False),
     "codes of densities": Model(codes=True, alpha_code=True),
     "points pushed": Model(pushed=True),
+    "points pushed, identity": Model(pushed=True, identity=True),
 }
 DEEP = {"depth": 6, "skip": 4}
 
@@ -327,6 +328,19 @@ def test_networks_that_do_not_fit_are_refused(path, tmp_path):
         d2nerf.read(written(MODELS["as run"], tmp_path, halved(*path)), BOX, 1)
 
 
+@pytest.mark.parametrize("time", [None, 1])
+def test_pushes_of_four_numbers_are_refused(time, tmp_path):
+    def change(params):
+        params["warp_field"]["mlp"]["logit"] = dense(np.random.default_rng(0), 16, 4)
+
+    checkpoint = written(MODELS["points pushed"], tmp_path, change)
+    if time is None:
+        assert d2nerf.read(checkpoint, BOX).nodes  # what stands still is as it is
+    else:
+        with pytest.raises(FormatError, match="should make 3 numbers, found 4"):
+            d2nerf.read(checkpoint, BOX, time)
+
+
 @pytest.mark.parametrize("named", ["branches_p", "branches_t"])
 def test_pivots_are_refused(named, tmp_path):
     def change(params):
@@ -336,12 +350,13 @@ def test_pivots_are_refused(named, tmp_path):
         d2nerf.read(written(MODELS["as run"], tmp_path, change), BOX, 1)
 
 
-def test_weights_by_which_earlier_versions_blend_are_refused(tmp_path):
+@pytest.mark.parametrize("time", [None, 1])
+def test_weights_by_which_earlier_versions_blend_are_refused(time, tmp_path):
     def change(params):
         params["nerf_mlps_fine"]["MLP_2"] = {"logit": dense(np.random.default_rng(0), 24, 1)}
 
     with pytest.raises(FormatError, match="blend_mode old or nsff"):
-        d2nerf.read(written(MODELS["as run"], tmp_path, change), BOX, 1)
+        d2nerf.read(written(MODELS["as run"], tmp_path, change), BOX, time)
 
 
 def test_shadows_of_other_skips_are_refused(tmp_path):

@@ -14,7 +14,7 @@ from fusedrf_cli.bridge.importing.splats import shells_of
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.python import open_scene
 from fusedrf_cli.requests import Input
-from tests.formats.splats.writers import content, sog_files, written, zipped
+from tests.formats.splats.writers import content, ply, sog_files, written, zipped
 
 
 def splat_file(path: Path, centres: np.ndarray, scale: float = 0.05) -> Path:
@@ -175,6 +175,19 @@ def test_a_time_is_said_to_be_of_no_use(tmp_path):
     file = splat_file(tmp_path / "balls.splat", np.zeros((3, 3)))
     report = verbs.import_field(file, tmp_path / "balls.rfpack", time=2.0)
     assert "nothing in it moves, and --time is not used" in report["notes"]
+
+
+@pytest.mark.parametrize(
+    "network", ["point_cloud/iteration_9/deformation.pth", "deform/iteration_9/deform.pth", "other.pth"]
+)
+@pytest.mark.parametrize("whole", [True, False])
+def test_splats_that_a_network_moves_are_said_to_rest(network, whole, tmp_path):
+    cloud = tmp_path / "run/point_cloud/iteration_9/point_cloud.ply"
+    for file, data in ((cloud, ply(content(4))), (tmp_path / "run" / network, b"x")):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(data)
+    notes = verbs.import_field(tmp_path / "run" if whole else cloud, tmp_path / "out.rfpack")["notes"]
+    assert any("stand where they rest" in note for note in notes) == ("other" not in network)
 
 
 def test_the_folder_of_a_sog_and_an_archive_of_splats(tmp_path):

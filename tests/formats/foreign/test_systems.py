@@ -253,7 +253,7 @@ def test_arrays_that_lie_elsewhere_are_said_to_be_a_systems(tmp_path, entries, l
         open_checkpoint(tmp_path / "a.th")
 
 
-@pytest.mark.parametrize("prefix", ["module.", "_orig_mod.", "module._orig_mod."])
+@pytest.mark.parametrize("prefix", ["module.", "_orig_mod.", "module._orig_mod.", "_orig_mod.module."])
 def test_names_of_a_model_on_several_gpus_or_compiled(prefix, tmp_path):
     path = write("torch-ngp", tmp_path)
     table = torch.load(path, weights_only=False)

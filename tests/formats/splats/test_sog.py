@@ -77,6 +77,17 @@ def test_how_it_was_trained_is_told(model, word, tmp_path):
     assert word in read(tmp_path, changed(sog_files(content()), model=model)).notes[0]
 
 
+def test_labels_before_the_palette_as_the_text_has_them(tmp_path):
+    files = sog_files(content(40))
+    expected = read(tmp_path, dict(files))
+    meta = json.loads(files["meta.json"])
+    palette, labels = (files.pop(name) for name in meta["shN"]["files"])
+    files |= {"shN_labels.webp": labels, "shN_centroids.webp": palette}
+    meta["shN"]["files"] = ["shN_labels.webp", "shN_centroids.webp"]
+    files["meta.json"] = json.dumps(meta).encode()
+    np.testing.assert_array_equal(read(tmp_path, files).harmonics, expected.harmonics)
+
+
 def test_antialiasing_as_playcanvas_states_it(tmp_path):
     assert "antialiasing" in read(tmp_path, changed(sog_files(content()), antialias=True)).notes[0]
     assert read(tmp_path, changed(sog_files(content()), antialias=False)).notes == ()

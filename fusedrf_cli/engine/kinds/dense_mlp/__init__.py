@@ -41,9 +41,10 @@ class HarmonicBuilder(ResampledBuilder):
     def build(self, storage: StorageSetting, limit: int) -> Candidate | None:
         """See `DirectBuilder`."""
         candidate = super().build(storage, limit)
-        if candidate is not None:
-            fit_decoder(candidate.field, self.scene)
-        return candidate
+        if candidate is None:
+            return None
+        fit_decoder(candidate.field, self.scene)
+        return replace(candidate, bytes=self.bytes_of(candidate.field, storage))
 
 
 KIND = DenseMLPKind()
