@@ -206,7 +206,8 @@ def best_of(
     except TooSmall as error:
         size = readable_size(error.smallest)
         if request.kind == registry.AUTO and kind.field is None:
-            raise NodesTooLarge(size, best_suited(composed, learnt=True)[0].name) from error
+            best = best_suited(composed, builder_request.limit - builder_request.overhead)[0]
+            raise NodesTooLarge(size, best.name) from error
         raise UsageProblem(
             f"--max-size is too small: the file takes {size} at its coarsest, "
             f"where {readable_size(builder_request.limit)} were allowed; give more"
@@ -275,9 +276,11 @@ def choose_kind(name: str, loaded: LoadedScene, composed: ComposedField) -> tupl
     return kind, suits.why
 
 
-def best_suited(composed: ComposedField, learnt: bool = False) -> tuple[Kind, str]:
-    """The kind that suits a scene best, and why; `learnt`: of those that make one field of it."""
-    suited = [(k.suits(composed), k) for k in registry.kinds() if k.field is not None or not learnt]
+def best_suited(composed: ComposedField, learnt_within: int | None = None) -> tuple[Kind, str]:
+    """The kind that suits a scene best, and why; learnt_within: bytes of those that make one field of it,
+    None: all."""
+    every = learnt_within is None
+    suited = [(k.suits(composed, learnt_within), k) for k in registry.kinds() if every or k.field is not None]
     suits, kind = max((pair for pair in suited if pair[0].score is not None), key=lambda pair: pair[0].score)
     return kind, suits.why
 

@@ -11,7 +11,7 @@ class ImportedKind(Kind):
 
     trains = False
 
-    def suits(self, scene: ComposedField) -> Suitability:
+    def suits(self, scene: ComposedField, limit: int | None = None) -> Suitability:
         """See Kind."""
         return Suitability(None, f"fields of kind '{self.name}' are imported, and nothing is fused to them")
 

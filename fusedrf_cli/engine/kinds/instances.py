@@ -53,7 +53,7 @@ class InstancesKind(Kind):
     takes = frozenset({"ranks", "sh_degree"})
     precisions = ("int4", "int8", "float16")
 
-    def suits(self, scene: ComposedField) -> Suitability:
+    def suits(self, scene: ComposedField, limit: int | None = None) -> Suitability:
         """Nothing is nearer to a scene, in far less time (decision 024)."""
         return Suitability(2.0, "every source stays a field of its own, in its own axes")
 

@@ -148,8 +148,8 @@ class Kind:
 
     # -- standing for a scene --------------------------------------------------------------------------------
 
-    def suits(self, scene: ComposedField) -> Suitability:
-        """Whether it can hold a scene, and how well."""
+    def suits(self, scene: ComposedField, limit: int | None = None) -> Suitability:
+        """Whether it can hold a scene, and how well; limit: in so many bytes, None: of any size."""
         return Suitability(0.0, f"a field of kind '{self.name}' learns whatever a scene shows")
 
     def builder(self, scene: ComposedField, request: BuildRequest) -> DistilledBuilder:

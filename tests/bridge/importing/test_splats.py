@@ -11,6 +11,7 @@ from formats.bundle import OpenBundle
 from formats.errors import UnknownCheckpoint
 from fusedrf_cli import verbs
 from fusedrf_cli.bridge.importing.splats import shells_of
+from fusedrf_cli.engine.kinds.planes import PlanesKind
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.python import open_scene
 from fusedrf_cli.requests import Input
@@ -54,15 +55,19 @@ def test_what_is_made_of_a_scene_is_upright_as_the_scene_is(tmp_path):
         assert OpenBundle(tmp_path / f"{made}.rfpack").scene.up == (0.0, -1.0, 0.0)
 
 
-def test_one_field_is_learnt_of_what_does_not_fit_as_it_is(tmp_path):
-    """An import is not made coarser, so that as a node it takes what it takes."""
+@pytest.mark.parametrize("kind", ["vm", pytest.param("planes", marks=pytest.mark.slow)])
+def test_one_field_is_learnt_of_what_does_not_fit_as_it_is(kind, tmp_path, monkeypatch):
+    """An import is not made coarser, so that as a node it takes what it takes; of the kind that is best in so
+    few bytes."""
+    if kind == "vm":
+        monkeypatch.setattr(PlanesKind, "few", 200_000)
     centres = np.random.default_rng(0).uniform(-1, 1, (20_000, 3))
     bundle, fused = tmp_path / "balls.rfpack", tmp_path / "fused.rfpack"
     verbs.import_field(splat_file(tmp_path / "balls.splat", centres), bundle)
     report = verbs.fuse(bundle, fused, max_size=300_000, time_budget=2)
-    assert report["kind"] == "vm" and report["bytes"] <= 300_000
+    assert report["kind"] == kind and report["bytes"] <= 300_000
     assert "as nodes the sources take" in report["kind_because"]
-    assert any("one field of the kind vm is learnt instead" in warning for warning in report["warnings"])
+    assert any(f"one field of the kind {kind} is learnt instead" in said for said in report["warnings"])
     with pytest.raises(UsageProblem, match="--max-size is too small"):
         verbs.fuse(bundle, tmp_path / "none.rfpack", max_size=2_000)
     assert not (tmp_path / "none.rfpack").exists()
@@ -70,6 +75,7 @@ def test_one_field_is_learnt_of_what_does_not_fit_as_it_is(tmp_path):
 
 def test_what_was_chosen_instead_of_nodes_goes_on(tmp_path, monkeypatch):
     """By the very words of the run that was interrupted, which say no kind."""
+    monkeypatch.setattr(PlanesKind, "few", 200_000)
     centres = np.random.default_rng(0).uniform(-1, 1, (20_000, 3))
     bundle, fused = tmp_path / "balls.rfpack", tmp_path / "fused.rfpack"
     verbs.import_field(splat_file(tmp_path / "balls.splat", centres), bundle)

@@ -1,9 +1,15 @@
 """What only products of planes do: several resolutions follow the field's texels."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from fusedrf_cli.bridge.fusing import best_suited
+from fusedrf_cli.engine import spaces
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.builder import StorageSetting
 from fusedrf_cli.engine.kinds.planes.field import PlanesConfig, PlanesField
@@ -46,6 +52,17 @@ def test_texels_between_those_that_there_are_change_no_answer(finer):
         fine.answers(fine.params, points, dirs), field.answers(field.params, points, dirs), strict=True
     ):
         torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_they_are_chosen_for_bounded_scenes_in_few_bytes():
+    field = random_boxed("vm")
+    around = field.with_occupancy(replace(field.occupancy, space=spaces.unbounded))
+    bounded, place = (ComposedField([Placed("one", one, np.eye(4))]) for one in (field, around))
+    for scene, limit, best in (
+        (bounded, 3_000_000, "planes"), (bounded, 20_000_000, "vm"), (place, 3_000_000, "vm"),
+    ):  # fmt: skip
+        assert best_suited(scene, limit)[0].name == best
+    assert best_suited(bounded)[0].name == "blocks"
 
 
 @pytest.mark.parametrize("wrong", [{"levels": 0}, {"features": 12}, {"features": True}, {"hidden": 12}])

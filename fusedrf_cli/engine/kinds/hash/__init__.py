@@ -21,7 +21,7 @@ class HashKind(BoxKind):
     """See Kind."""
 
     name = "hash"
-    good_for = "Surroundings and objects of fine detail, as Instant-NGP holds them."
+    good_for = "Surroundings of fine detail, as Instant-NGP holds them; of objects vm shows more in fewer MB."
     field = HashField
     taught_by_pictures = True
 

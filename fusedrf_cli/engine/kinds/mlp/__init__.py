@@ -8,7 +8,7 @@ class MLPKind(BoxKind):
     """See Kind."""
 
     name = "mlp"
-    good_for = "The fewest bytes, as NeRF has them; slow to learn and to draw."
+    good_for = "The fewest bytes, as NeRF has them; slow, and cp shows far more in twice as many."
     field = MLPField
 
 

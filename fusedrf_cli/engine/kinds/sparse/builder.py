@@ -84,7 +84,7 @@ class SparseKind(Kind):
     """Bricks of voxels."""
 
     name = "sparse"
-    good_for = "Scenes of any sources and any rule, with detail in few places; edits stay local."
+    good_for = "Scenes of any sources and rule, with detail in few places: as much as vm, in more time."
     field = SparseField
     takes = reduces = frozenset({"sh_degree"})
     precisions = ("int8", "float16")

@@ -89,7 +89,7 @@ class VMKind(BoxKind):
         """See Kind."""
         return VMStudentBuilder(self, scene, request)
 
-    def suits(self, scene: ComposedField) -> Suitability:
+    def suits(self, scene: ComposedField, limit: int | None = None) -> Suitability:
         """It holds any scene, one that is not stretched and has its detail everywhere best."""
         return Suitability(1.0, "one vm field over the scene learns any sources by any rule")
 
