@@ -63,8 +63,8 @@ ABOUT = {
     "not know that they are alike. *MB held* are their numbers and cells in memory, *frame* is the median of "
     "five as composed, and *naive* that of the composition that asks every field at every sample.",
     "students": "Four trained objects that fill the frame, distilled into one field of each kind in a minute "
-    "of learning: PSNR against the scene as composed on views that nothing was learnt from, and of the pixels "
-    "that it covers; *seconds* are those of the whole command.",
+    "of learning: PSNR against the scene as composed on views that nothing was learnt from, and of the "
+    "pixels that it covers; *seconds* are those of the whole command.",
     "converted": "Each kind once into the next. *Lost* is the PSNR of the weaker of both kinds, trained from "
     "photos for as long, less that of the converted field, on the chair's test set.",
     "others": "N chairs of the kind `vm` side by side. *ranks* are those fields' components put side by side "
