@@ -37,8 +37,8 @@ MAX_FILES = 2000
 MAX_TRIED = 50
 MAX_NAMES = 50_000
 """Names of a checkpoint that its system is told by."""
-WRAPPERS = "module.", "_orig_mod.", "module."
-"""In front of the names of a wrapped model's numbers."""
+WRAPPED = re.compile(r"(module\.|_orig_mod\.)+")
+"""What stands in front of all names of a model that runs on several GPUs, or is compiled."""
 CAPTURED = (
     "active_sh_degree", "_xyz", "_features_dc", "_features_rest", "_scaling", "_rotation", "_opacity",
     "max_radii2D", "xyz_gradient_accum", "denom", "optimizer", "spatial_lr_scale",
@@ -110,7 +110,7 @@ def known_systems() -> str:
 
 def _likeness(names: list[str]) -> str:
     """Of names that lie elsewhere in a system's own files, what they should be; "" of any others."""
-    last = [name.rpartition("/")[2].removeprefix("module.") for name in names]
+    last = [name.rpartition("/")[2] for name in names]
     for system in (system for system in SYSTEMS.values() if system.is_read):
         for words in system.rule.split("|"):
             wanted = [word for word in words.split() if not word.startswith("!")]
@@ -154,13 +154,11 @@ def _table(value: object) -> dict:
 
 
 def _unwrapped(entries: dict, levels: int = 3) -> dict:
-    """Entries without what torch puts in front of all names of a model that runs on several GPUs, or is
-    compiled."""
+    """Entries by the names that a model's numbers have when it is not wrapped, in the first levels."""
     if levels == 0:
         return entries
-    wrapped = (prefix for prefix in WRAPPERS if all(str(name).startswith(prefix) for name in entries))
-    while entries and (prefix := next(wrapped, None)):
-        entries = {str(name).removeprefix(prefix): value for name, value in entries.items()}
+    if all(WRAPPED.match(str(name)) for name in entries):
+        entries = {WRAPPED.sub("", name, count=1): value for name, value in entries.items()}
     return {
         name: _unwrapped(value, levels - 1) if isinstance(value, dict) else value
         for name, value in entries.items()

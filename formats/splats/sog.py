@@ -115,8 +115,7 @@ def is_sog(path: Path | str) -> bool:
             names = pack.namelist()
     except BadSplats:
         return False
-    pictures = any(name.endswith((".webp", ".png")) for name in names)
-    return pictures and any(name.rpartition("/")[2] == META for name in names)
+    return any(name.rpartition("/")[2] == META for name in names) and any(n.endswith(".webp") for n in names)
 
 
 def read_sog(path: Path | str, data: bytes) -> Splats:
