@@ -78,13 +78,13 @@ def fuse(
     history; `somewhere` writes, as `written_somewhere` does. Where `auto` would keep the sources as nodes and
     these do not fit, one field is learnt; a run that goes on learns the kind that it had chosen."""
     if (chosen := chosen_before(request)) is not None:
-        report = fuse_as(replace(request, kind=chosen), progress, load, somewhere)
+        report = fuse_as(replace(request, kind=chosen), progress, load, somewhere, nodes_fit=False)
         return report | {"kind_because": "the run that went on had chosen it"}
     try:
         return fuse_as(request, progress, load, somewhere)
     except NodesTooLarge as error:
         progress.warn(f"{error}, more than --max-size: one field of the kind {error.kind} is learnt instead")
-        report = fuse_as(replace(request, kind=error.kind), progress, load, somewhere)
+        report = fuse_as(replace(request, kind=error.kind), progress, load, somewhere, nodes_fit=False)
         return report | {"kind_because": str(error)}
 
 
@@ -96,8 +96,9 @@ def chosen_before(request: FuseRequest) -> str | None:
     return name if name in registry.names() and registry.kind(name).field is not None else None
 
 
-def fuse_as(request: FuseRequest, progress, load: Load, somewhere: Callable) -> dict:
-    """`fuse` by the kind that suits the scene. Raises NodesTooLarge."""
+def fuse_as(request: FuseRequest, progress, load: Load, somewhere: Callable, nodes_fit: bool = True) -> dict:
+    """`fuse` by the kind that suits the scene; nodes_fit: whether its sources may be told to stay nodes.
+    Raises NodesTooLarge."""
     started = time.monotonic()
     with engine(request.device, request.threads, progress) as device:
         progress.phase("reading", None)
@@ -138,7 +139,8 @@ def fuse_as(request: FuseRequest, progress, load: Load, somewhere: Callable) -> 
             )
             checkpoint_path(request.output).unlink(missing_ok=True)
         reports = made.resolution_reports()
-        warn_of_resolution(reports, remedy(kind, scene.composed), progress)
+        other = best_suited(scene.composed)[0] if nodes_fit else kind
+        warn_of_resolution(reports, remedy(kind, other), progress)
         if kind.field is None and request.max_size is None:
             warn_of_default_size(made.builder.request, progress)
         figures = made.figures()
@@ -285,9 +287,8 @@ def best_suited(composed: ComposedField, learnt_within: int | None = None) -> tu
     return kind, suits.why
 
 
-def remedy(kind: Kind, composed: ComposedField) -> str:
-    """What helps an object that is held too coarsely."""
-    best = best_suited(composed)[0]
+def remedy(kind: Kind, best: Kind) -> str:
+    """What helps an object that is held too coarsely by a kind, where another one is the best."""
     return "a larger --max-size" if best is kind else f"--kind {best.name}, or a larger --max-size"
 
 
@@ -438,7 +439,7 @@ def warn_of_resolution(reports: list[ResolutionReport], remedy: str, progress) -
             )
         if d.voxels_across < config.enough_voxels:
             progress.warn(f"'{d.name}' is only {d.voxels_across:.2g} voxels across; use {remedy}")
-    if coarse := [d for d in reports if d.held_voxel > d.own_voxel * (1 + 1e-6)]:
+    if coarse := [d for d in reports if d.held_voxel > config.noted * d.own_voxel]:
         worst = max(coarse, key=lambda d: d.held_voxel / d.own_voxel)
         progress.warn(
             f"{len(coarse)} of {len(reports)} objects are held at coarser voxels than their own, "

@@ -12,6 +12,8 @@ class ResolutionConfig:
 
     enough_voxels: int = 8
     """Across an object, under which there is no shape left."""
+    noted: float = 1.05
+    """Times an object's own voxel from which it is held more coarsely."""
 
 
 @dataclass(frozen=True)

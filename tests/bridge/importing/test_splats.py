@@ -68,6 +68,7 @@ def test_one_field_is_learnt_of_what_does_not_fit_as_it_is(kind, tmp_path, monke
     assert report["kind"] == kind and report["bytes"] <= 300_000
     assert "as nodes the sources take" in report["kind_because"]
     assert any(f"one field of the kind {kind} is learnt instead" in said for said in report["warnings"])
+    assert not any("--kind blocks" in said for said in report["warnings"])  # which did not fit
     with pytest.raises(UsageProblem, match="--max-size is too small"):
         verbs.fuse(bundle, tmp_path / "none.rfpack", max_size=2_000)
     assert not (tmp_path / "none.rfpack").exists()
