@@ -45,14 +45,14 @@ from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.settings import current
 
-SCENES = {"chair": (60, 300), "fox": (60, 300), "bear": (600,)}
+SCENES = {"chair": (60, 300), "fox": (60, 180), "bear": (60, 180)}
 """Seconds of learning of each capture."""
 EVERY = 8  # photos of which one is held out, where a capture has no test set
 NUMBERS = 1, 2, 4, 8  # of copies
 SIZES = 1, 3, 10, 25  # megabytes of a student
 KEYS = {
     "trained": ("kind", "capture", "minutes"), "composed": ("kind", "N"),
-    "students": ("kind", "at most, MB", "finetuned"), "converted": ("from", "to"),
+    "students": ("kind", "at most, MB", "finetuned"), "converted": ("from", "to", "minutes"),
     "others": ("way", "N"),
 }  # fmt: skip
 """Of each part, the columns by which a row is known."""

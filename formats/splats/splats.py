@@ -69,8 +69,8 @@ def gathered(
     notes: Sequence[str] = (),
 ) -> Splats:
     """Splats of arrays as a file holds them, shapes as in `Splats`, of which those with NaN, infinite or
-    absurd numbers are left out; quaternions of any length, that of no length is no rotation. Raises BadSplats
-    where none is left."""
+    absurd numbers are left out; quaternions of any length, that of no length is no rotation, which a note
+    says. Raises BadSplats where none is left."""
     notes, count = list(notes), len(centres)
     sizes = scales.max(1) if count else scales[:, 0]
     sound = _within(centres) & _within(scales) & (scales.min(1, initial=0) >= 0) & (sizes > 0)
@@ -83,6 +83,9 @@ def gathered(
         centres, scales, rotations, opacities, harmonics = (
             each[sound] for each in (centres, scales, rotations, opacities, harmonics)
         )
+    if still := len(rotations) - int(np.count_nonzero(np.any(rotations, axis=1))):
+        left = counted(still, "splat has", "splats have")
+        notes.append(f"{left} a quaternion of no length, and lie along the axes")
     return Splats(
         np.ascontiguousarray(centres, np.float32),
         thickened(scales),

@@ -74,6 +74,7 @@ def test_rotations_of_no_length_are_none_and_discs_have_some_thickness(tmp_path)
     zero = {f"rot_{i}": np.zeros(5) for i in range(4)}
     splats = read(tmp_path, ply_columns(content()) | zero | {"scale_0": np.full(5, -200.0)})
     assert splats.rotations.tolist() == [[1, 0, 0, 0]] * 5
+    assert "5 splats have a quaternion of no length" in splats.notes[0]
     np.testing.assert_allclose(splats.scales[:, 0], 1e-6 * splats.scales.max(1), rtol=1e-5)
 
 
