@@ -26,7 +26,7 @@ ARRAY, SCALAR = 1, 3
 
 def read_msgpack(path: Path | str) -> dict:
     """The map of a MessagePack file, gzip undone: binaries are bytes, flax's arrays StoredTensors and its
-    scalars numpy's; an object {"bytes": [0 to 255, …]}, as which converters to JSON write them, is bytes too.
+    scalars numpy's.
 
     Raises BadCheckpoint, LimitExceeded, MissingFile, NotAFile, ResourceError.
     """
@@ -90,12 +90,10 @@ class _Count:
     def list(self, items: list) -> list:
         return self._counted(items)
 
-    def map(self, pairs: list) -> dict | bytes:
+    def map(self, pairs: list) -> dict:
         table = dict(self._counted(pairs))
         if len(table) != len(pairs):
             raise BadCheckpoint(f"{self.path}: a key of its MessagePack appears twice")
-        if "bytes" in table and table.keys() <= {"bytes", "subtype"} and isinstance(table["bytes"], list):
-            return bytes(table["bytes"])
         return table
 
     def _counted(self, items: list) -> list:

@@ -283,7 +283,6 @@ SYSTEMS = {  # the first whose rule fits counts
     "dmpigo": System(
         "DVGO (NDC)",
         f"model_state_dict/act_shift.grid:* {_GRIDS} | model_state_dict/act_shift:1x1x1x1x* {_GRIDS}",
-        ("config.py",),
         is_read=False,
     ),
     "dvgo": System(  # of its first version without classes of grids

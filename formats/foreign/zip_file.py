@@ -16,6 +16,8 @@ MAX_DIRECTORY = 8 << 20
 MAX_RATIO = 250
 """How often larger than its bytes in the file a member may become, beyond FREE bytes."""
 FREE = 64 << 20
+MOST_READ = 64
+"""How often as much as all members unpack to may be read: tensors share what they are stored in."""
 LOCAL = struct.Struct("<4s22xHH")
 DAMAGED = (
     zipfile.BadZipFile,
@@ -51,6 +53,7 @@ class Archive:
                 raise BadCheckpoint(f"{path}: not a whole ZIP archive ({error}); copy it again") from error
             size = os.fstat(file.fileno()).st_size
         self.members: dict[str, Member] = {}
+        self.read_bytes = 0
         for entry in entries:
             name = entry.filename
             if name in self.members:
@@ -72,8 +75,11 @@ class Archive:
             self.members[name] = Member(entry.header_offset, packed, entry.file_size, entry.CRC, deflated)
 
     def read(self, name: str) -> bytes | bytearray:
-        """All bytes of a member. Raises BadCheckpoint, ChecksumMismatch."""
+        """All bytes of a member. Raises BadCheckpoint, ChecksumMismatch, LimitExceeded."""
         member = self.members[name]
+        self.read_bytes += member.size
+        if self.read_bytes > MOST_READ * sum(each.size for each in self.members.values()):
+            raise LimitExceeded(f"{self.path}: what it holds uses member {name} and others over and over")
         with open_input(self.path) as file:
             data = self._data(file, name, member)
         if member.deflated:

@@ -52,6 +52,7 @@ def read_ply(path: Path | str, data: bytes) -> Splats:
     lines, elements = read_elements(path, data, BadSplats)
     tables = dict(elements)
     vertices, notes = tables.pop("vertex", {}), []
+    check_count(path, len(next(iter(vertices.values()), ())))
     compressed = set(PACKED) <= set(vertices)
     chunks, rest = (tables.pop("chunk", {}), tables.pop("sh", {})) if compressed else ({}, {})
     not_honoured(tables, notes, "elements")
@@ -113,7 +114,6 @@ def _series(columns: dict, stem: str) -> list[str]:
 
 def _plain(path, vertices: _Columns, up: tuple[float, float, float], notes: list[str]) -> Splats:
     centres = vertices.rows(AXES)
-    check_count(path, len(centres))
     axes, rest = _series(vertices, "scale_")[:3], _series(vertices, "f_rest_")
     opacities = sigmoid(vertices.rows(["opacity"])[:, 0])
     scales = sizes_of(vertices.rows(axes or ["scale_0"]), notes)
@@ -169,7 +169,6 @@ def _filtered(scales: np.ndarray, opacities: np.ndarray, least: np.ndarray) -> t
 def _compressed(path, chunks: _Columns, vertices: _Columns, rest: _Columns, notes: list[str]) -> Splats:
     """Numbers of 8 to 11 bits between the least and the largest of a chunk of 256 splats."""
     packed = vertices.rows(PACKED, np.uint32)
-    check_count(path, len(packed))
     if len(chunks.rows(["min_x"])) != -(-len(packed) // CHUNK):
         raise BadSplats(
             f"{path}: has {len(chunks['min_x']):,} chunks for {len(packed):,} splats, expected one for "

@@ -1,6 +1,8 @@
 """What every reader of splats gives: Gaussians in the world of their file, with finite numbers."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +24,7 @@ DOWN_Y, UP_Y, UP_Z = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 ANTIALIASED = "was trained with antialiasing (Mip-Splatting's 2D filter), which is not imitated"
 SH_0 = 0.28209479177387814
 """The constant harmonic: a colour is 0.5 + SH_0 times its first coefficient."""
+_ADMIT: ContextVar[Callable[[int], None] | None] = ContextVar("admit", default=None)
 DISCS = "its splats are discs of 2D Gaussian splatting; they are shown as very thin ellipsoids"
 
 
@@ -134,8 +137,8 @@ def _unit(quaternions: np.ndarray) -> np.ndarray:
 
 
 def check_count(path: Path | str, count: int, n_bytes: int | None = None) -> None:
-    """Raises BadSplats for none, and LimitExceeded for more than are read, or than so many compressed bytes
-    can hold."""
+    """Raises BadSplats for none, LimitExceeded for more than are read, or than so many compressed bytes can
+    hold, and what `admitted` raises. Every reader asks this before it makes an array of so many splats."""
     if not count:
         raise BadSplats(f"{path}: holds no splats; export it again")
     most = MAX_SPLATS
@@ -143,6 +146,19 @@ def check_count(path: Path | str, count: int, n_bytes: int | None = None) -> Non
         most = min(most, max(FREE_SPLATS, SPLATS_PER_BYTE * n_bytes))
     if count > most:
         raise LimitExceeded(f"{path}: counts {count:,} splats, but at most {most:,} are read of such a file")
+    if (admit := _ADMIT.get()) is not None:
+        admit(count)
+
+
+@contextlib.contextmanager
+def admitted(admit: Callable[[int], None]) -> Iterator[None]:
+    """While splats are read in it, `admit` is given how many there are before they are; it raises to refuse
+    them."""
+    token = _ADMIT.set(admit)
+    try:
+        yield
+    finally:
+        _ADMIT.reset(token)
 
 
 def of_colours(colours: np.ndarray) -> np.ndarray:

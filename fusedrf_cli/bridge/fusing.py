@@ -121,18 +121,7 @@ def fuse_as(request: FuseRequest, progress, load: Load, somewhere: Callable, nod
         pixels = current(BuildingConfig).views * current(DistilConfig).view_size ** 2
         warn_of_work(request.scene, scene.composed, pixels, progress)
         made = best_of(request, scene, kind, bundle.overhead, memory, device, progress, saved)
-        entry = {
-            "event": "fused",
-            "kind": kind.name,
-            "composition": loaded.composition,
-            "settings": {
-                "seed": request.seed,
-                "max_size": made.builder.request.limit,
-                "rgb": request.finetune,
-                "from_scratch": request.from_scratch,
-            },
-            "psnr": reached_by(made.kept, made.builder),
-        }
+        entry = history_entry(request, kind.name, loaded.composition, made)
         with without_interrupts(request.output):  # what was made comes before what is found out about it
             size = somewhere(
                 request.output, lambda output: bundle.write(output, made.kept, made.background, entry)
@@ -157,6 +146,18 @@ def fuse_as(request: FuseRequest, progress, load: Load, somewhere: Callable, nod
     }
     check_target(report, request.target_psnr, request.output)
     return report
+
+
+def history_entry(request: FuseRequest, kind: str, composition: str, made: "Candidate") -> dict:
+    """What the bundle's history tells of a fuse."""
+    return {
+        "event": "fused", "kind": kind, "composition": composition,
+        "settings": {
+            "seed": request.seed, "max_size": made.builder.request.limit, "rgb": request.finetune,
+            "from_scratch": request.from_scratch,
+        },
+        "psnr": reached_by(made.kept, made.builder),
+    }  # fmt: skip
 
 
 @dataclass(frozen=True)

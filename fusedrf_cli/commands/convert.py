@@ -24,7 +24,7 @@ from fusedrf_cli.option_types import FieldKindType, InputType
 def command(**words):
     """Turn a field into one of another kind that shows the same.
 
-    FIELD is a bundle, trained or fused. The report gives PSNR and SSIM against it on views
+    FIELD is a bundle, trained, imported or fused. The report gives PSNR and SSIM against it on views
     that nothing was learnt from, and bytes before and after.
 
     \b

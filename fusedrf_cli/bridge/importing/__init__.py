@@ -52,8 +52,8 @@ BOXLESS = "nerf-pytorch", "krrish-nerf", "hashnerf", "d2nerf"
 """Systems whose files have no box."""
 MOVING = "k-planes", "d2nerf"
 """Systems whose scenes may move."""
-MOVED = "nerfacto", "splatfacto"
-"""Systems whose runs tell how they moved their captures."""
+MOVED = "nerfacto", "splatfacto", "svox2"
+"""Systems of which a run or a capture tells how they moved its cameras."""
 SPLATS = "splatfacto", "gsplat", "3dgs"
 """Systems whose scenes are Gaussian splats."""
 UNREAD = {
@@ -143,7 +143,7 @@ def imported_from(
     given |= {"capture": capture} if checkpoint.system in MOVED else {}
     try:
         imported = read(checkpoint, **given)
-    except (FormatError, ValueError) as error:
+    except (FormatError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError) as error:
         where = "" if str(error).startswith(f"{checkpoint.path}: ") else f"{checkpoint.path}: "
         cure = f"copy it again, or save it with {SYSTEMS[checkpoint.system].title} as it is published"
         raise InvalidInput(f"{where}{error}" + ("" if "; " in str(error) else f"; {cure}")) from error
@@ -190,6 +190,11 @@ def box_of(request: ImportRequest, capture: Capture | None, checkpoint: Checkpoi
         raise UsageProblem(
             f"{request.path} was trained in normalised device coordinates, in which a capture's cameras do "
             "not lie; give its box there as --aabb, such as -1.5,-1.67,-1,1.5,1.67,1"
+        )
+    if nerf.of_llff(checkpoint):
+        raise UsageProblem(
+            f"{request.path} was trained on an LLFF capture, whose cameras its loader moved and scaled, and "
+            "how is told nowhere; give its box there as --aabb xmin,ymin,zmin,xmax,ymax,zmax"
         )
     if capture is None or request.near is None or request.far is None:
         raise UsageProblem(

@@ -70,6 +70,8 @@ class Model:
             for key, value in settings.items() if isinstance(settings, Mapping) else ():
                 owner, _, last = str(key).rpartition(".")
                 if last == name and owner != "StaticNerfModel" and isinstance(value, int | float):
+                    if not np.isfinite(value):
+                        raise FormatError(f"its settings: '{key}' should be a number, found {value}")
                     return value
         return default
 
@@ -217,8 +219,9 @@ class Dynamic:
         degrees = {*([said] if said >= 0 else range(25)), *[0] * constant}
         identities = self.model.identity, not self.model.identity
         for identity, count in itertools.product(identities, (own, *range(25 if said >= 0 else 0))):
-            degree = (inputs - 6 * count - 3 * identity) / (2 * dims)
-            if degree in degrees:
+            left = inputs - 6 * count - 3 * identity
+            degree = left / (2 * dims) if dims else 0  # without a coordinate there is nothing to encode
+            if degree in degrees if dims else left == 0:
                 self.count, self.identity, self.coordinate_count = count, identity, int(degree)
                 return self.encode_constants(constant, dims)
         raise FormatError(

@@ -6,6 +6,7 @@ import numpy as np
 from formats.errors import FormatError
 from fusedrf_cli.bridge.importing.cells import MOST_CELLS
 from fusedrf_cli.bridge.importing.parts import (
+    LLFF,
     Y0,
     ColourInput,
     Entries,
@@ -63,6 +64,9 @@ def read(checkpoint) -> Imported:
     base = (np.prod(box[3:] - box[:3]) / voxels) ** (1 / 3)
     cells, more_notes = cells_of(kwargs, state, box, space)
     field = parts_field(shape, box, resolution, values | shading, 1 / base, shift_of(kwargs, state), cells)
+    data = checkpoint.beside.get("config.py", {}).get("data")
+    if isinstance(data, dict) and data.get("dataset_type") == "llff":
+        more_notes = [*more_notes, LLFF]
     return Imported([ImportedNode(field, placement)], notes + more_notes)
 
 

@@ -11,6 +11,7 @@ import torch
 
 from formats.errors import FormatError
 from fusedrf_cli.bridge.importing.parts import (
+    LLFF,
     Y0,
     ColourInput,
     Entries,
@@ -32,6 +33,7 @@ SAMPLES = 256
 """Vertices along the longest side by which rays are sampled."""
 BASE, FINEST = 16, 512  # vertices of HashNeRF's coarsest grid, and of the finest where nothing is said
 FIRST_PRIMES = 73856093, 19349663, 83492791
+MOST_LEVELS = 32
 FINE = "of its coarse and fine networks the fine one is taken"
 NDC = (
     "its frame is that of the normalised device coordinates that it was trained in; its colours read the "
@@ -122,6 +124,8 @@ def read_hashed(checkpoint, box: np.ndarray) -> Imported:
     """The same of HashNeRF's small networks, which read a hash grid over the box."""
     state, notes = network_of(checkpoint, "network_fn_state_dict", "network_fine_state_dict")
     tables = Entries(checkpoint.entries).inside("embed_fn_state_dict")
+    if len(tables.values) > MOST_LEVELS:
+        raise FormatError(f"hash grids of up to {MOST_LEVELS} levels are read, found {len(tables.values)}")
     names = [f"embeddings.{level}.weight" for level in range(max(len(tables.values), 1))]
     first = tables.array(names[0], None, None)
     check_hash(first)
@@ -187,16 +191,27 @@ def network_of(checkpoint, coarse: str, fine: str) -> tuple[Entries, list[str]]:
     """The state of the fine network, or of the only one, and what is to be said of it."""
     entries = Entries(checkpoint.entries)
     notes = [FINE] if entries.values.get(fine) else []
-    notes += [NDC] if in_ndc(checkpoint) else []
+    notes += [NDC] if in_ndc(checkpoint) else [LLFF] if of_llff(checkpoint) else []
     return entries.inside(fine if entries.values.get(fine) else coarse), notes
 
 
 def in_ndc(checkpoint) -> bool:
     """Whether the settings beside a checkpoint say that it was trained in normalised device coordinates."""
+    return without_ndc(checkpoint) is False
+
+
+def of_llff(checkpoint) -> bool:
+    """Whether they say that it was trained on an LLFF capture as its loader moved and scaled it."""
+    return without_ndc(checkpoint) is True
+
+
+def without_ndc(checkpoint) -> bool | None:
+    """What the settings beside a checkpoint of an LLFF capture have as no_ndc; None of others."""
     args = checkpoint.beside.get("args.txt", {})
     dataset = checkpoint.beside.get("config.yml", {}).get("dataset")
-    no_ndc = dataset.get("no_ndc") if isinstance(dataset, dict) else args.get("no_ndc")
-    return no_ndc is False and args.get("dataset_type", "llff") == "llff"
+    said = dataset if isinstance(dataset, dict) else args
+    kind = said.get("type", "llff") if said is dataset else said.get("dataset_type", "llff")
+    return said.get("no_ndc") if str(kind).lower() == "llff" else None
 
 
 def check_biases(state: Entries) -> None:

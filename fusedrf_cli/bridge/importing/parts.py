@@ -22,6 +22,8 @@ from fusedrf_cli.engine.kinds.assembled.field import PartsField, PartsShape
 Y0 = 0.28209479177387814  # the spherical harmonic of degree 0
 Layer = tuple[np.ndarray, np.ndarray | None]
 """The weights (outputs, inputs) and the bias (outputs,) of a dense layer."""
+LLFF = "its loader moved and scaled its cameras, and how is told nowhere: the capture's own do not fit"
+"""What is to be said of what was trained on an LLFF capture in its own world."""
 
 
 @dataclass(frozen=True)

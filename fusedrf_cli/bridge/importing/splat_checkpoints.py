@@ -29,7 +29,7 @@ from formats.splats.splats import (
 from formats.views import Capture
 from fusedrf_cli.bridge.importing.nerfacto import model_settings, named, placement_of, state_of, up_of
 from fusedrf_cli.bridge.importing.parts import Entries, Imported
-from fusedrf_cli.bridge.importing.splats import fields_of
+from fusedrf_cli.bridge.importing.splats import as_fits, fields_of
 from fusedrf_cli.bridge.memory import Memory
 
 
@@ -80,13 +80,17 @@ class Held(NamedTuple):
 def read(checkpoint: Checkpoint, memory: Memory) -> Imported:
     """The fields of a checkpoint of 3DGS, 2DGS or gsplat. Raises FormatError."""
     made = {"3dgs": of_3dgs, "gsplat": of_gsplat}[checkpoint.system]
-    return fields_of(made(checkpoint), memory)
+    with as_fits(memory):
+        splats = made(checkpoint)
+    return fields_of(splats)
 
 
 def read_splatfacto(checkpoint: Checkpoint, memory: Memory, capture: Capture | None = None) -> Imported:
     """The fields of splatfacto's splats, where their capture lies. Raises FormatError."""
     placement, said = placement_of(checkpoint.beside.get("dataparser_transforms.json"), capture)
-    return fields_of(of_splatfacto(checkpoint, up_of(placement)), memory, placement, said)
+    with as_fits(memory):
+        splats = of_splatfacto(checkpoint, up_of(placement))
+    return fields_of(splats, placement, said)
 
 
 # -- what each trainer holds ---------------------------------------------------------------------------------

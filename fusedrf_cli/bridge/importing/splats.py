@@ -1,22 +1,22 @@
 """Gaussian splats (Kerbl et al. 2023) of any format that formats/splats reads."""
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
 
 from formats.splats.reading import read_splats
-from formats.splats.splats import Splats
+from formats.splats.splats import Splats, admitted
 from fusedrf_cli.bridge.importing.parts import Imported, ImportedNode
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.kinds.splats.device_functions import REACH
 from fusedrf_cli.engine.kinds.splats.field import SplatsField
-from fusedrf_cli.errors import InvalidInput
 
 PER_SPLAT = 2000
 """Bytes while a field is made of a splat, and written."""
-
+ADVICE = "close other programs, or raise --memory"
 
 MOST_SHELLS = 4
 INNER = 0.99
@@ -28,20 +28,21 @@ the surroundings, would be too coarse for the others."""
 
 def read(path: Path | str, memory: Memory) -> Imported:
     """The fields of a file. Raises FormatError."""
-    splats = read_splats(path)
-    if not len(splats):
-        raise InvalidInput(f"{path}: holds no splats")
-    return fields_of(splats, memory, notes=[f"it is {splats.kind}"])
+    memory.expect({"the file": float(Path(path).stat().st_size)}, advice=ADVICE)
+    with as_fits(memory):
+        splats = read_splats(path)
+    return fields_of(splats, notes=[f"it is {splats.kind}"])
 
 
-def fields_of(
-    splats: Splats, memory: Memory, placement: np.ndarray | None = None, notes: Sequence[str] = ()
-) -> Imported:
-    """The fields of splats, which `placement` (4, 4) puts into the world that `splats.up` is of."""
-    memory.expect(
-        {f"{len(splats):,} splats": float(PER_SPLAT * len(splats))},
-        advice="close other programs, or raise --memory",
+def as_fits(memory: Memory) -> AbstractContextManager[None]:
+    """Splats read in it are as many as memory has room for. Raises ResourceProblem."""
+    return admitted(
+        lambda count: memory.expect({f"{count:,} splats": float(PER_SPLAT * count)}, advice=ADVICE)
     )
+
+
+def fields_of(splats: Splats, placement: np.ndarray | None = None, notes: Sequence[str] = ()) -> Imported:
+    """The fields of splats, which `placement` (4, 4) puts into the world that `splats.up` is of."""
     shells = shells_of(boxes_around(splats))
     nodes = [
         ImportedNode(

@@ -1,11 +1,14 @@
 """Plenoxels' files (Fridovich-Keil et al., CVPR 2022; github.com/sxyu/svox2): a SparseGrid's .npz."""
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from formats.errors import FormatError, LimitExceeded
+from formats.views import Capture
 from fusedrf_cli.bridge.importing.parts import (
     Entries,
     Imported,
@@ -27,12 +30,15 @@ MOST_CELLS = 256
 SH, TEXTURE, NETWORK = 1, 4, 255
 """Of `basis_type`."""
 NDC = "it seems to be learnt in NDC of its cameras, whose lenses it does not tell: it lies as it is there"
+BLENDER_SCALE = 2 / 3
+"""What svox2 multiplies the positions of a Blender capture's cameras by, unless told otherwise."""
 MLP = "pt__basis_mlp__"
 """In front of the names of its layers."""
 
 
-def read(checkpoint) -> Imported:
-    """The fields of a file: a grid, and the background around it, if any. Raises FormatError."""
+def read(checkpoint, capture: Capture | None = None) -> Imported:
+    """The fields of a file: a grid, and the background around it, if any; where its run's settings or the
+    capture it was learnt from tell, as large as that. Raises FormatError."""
     entries = Entries(checkpoint.entries)
     middle, radius = triple_of(entries, "center", 0.0), triple_of(entries, "radius", 1.0)
     if not (radius > 0).all():
@@ -40,11 +46,37 @@ def read(checkpoint) -> Imported:
     nodes = [grid_of(entries, middle, radius)]
     if background := background_of(entries, middle, radius):
         nodes = [replace(nodes[0], suffix=" grid"), background]
-    kind = checkpoint.beside.get("args.json", {}).get("dataset_type", "auto")
+    settings = checkpoint.beside.get("args.json", {})
+    kind = settings.get("dataset_type", "auto")
     # of LLFF's captures its own loader makes such a box, and nothing else does
     forward = not middle.any() and radius[2] == 1 and (radius[:2] > 1).all()
-    in_ndc = kind == "llff" or kind == "auto" and bool(forward)
-    return Imported(nodes, [NDC] * in_ndc, rule="add")
+    if kind == "llff" or kind == "auto" and bool(forward):
+        return Imported(nodes, [NDC], rule="add")
+    scale, note = camera_scale(settings, capture)
+    grown = np.diag([1 / scale] * 3 + [1.0])
+    nodes = [replace(node, object_to_world=grown @ node.object_to_world) for node in nodes]
+    return Imported(nodes, [note], rule="add")
+
+
+def camera_scale(settings: Mapping[str, Any], capture: Capture | None) -> tuple[float, str]:
+    """By how much svox2 scaled the positions of a capture's cameras, as far as its run's args.json or the
+    capture tells, and what is to be said of it. Raises FormatError."""
+    kind = settings.get("dataset_type", "auto")
+    if kind == "nerf" or kind == "auto" and capture is not None and capture.kind == "blender":
+        stated = settings.get("scene_scale")
+        scale = BLENDER_SCALE if stated is None else Entries(settings, "args.json: ").number("scene_scale")
+        if not 1e-6 < scale < 1e6:
+            raise FormatError(f"args.json: 'scene_scale' should be above 0, found {scale:g}")
+        return scale, f"it lies where its capture does: its cameras, scaled by {scale:.4g}, are scaled back"
+    if kind == "auto" and capture is None:
+        return 1.0, (
+            "it lies where svox2 put its cameras, whose positions it scales, those of a Blender capture by "
+            "2/3; --cameras CAPTURE undoes that"
+        )
+    return 1.0, (
+        "it lies where svox2 put its cameras, which it moves and scales unless they are a Blender capture's; "
+        "how is told nowhere, and the capture's own cameras may not fit"
+    )
 
 
 def triple_of(entries: Entries, name: str, usual: float) -> np.ndarray:

@@ -11,6 +11,8 @@ from fusedrf_cli.bridge.importing.parts import Layer
 FUSED = 16, 32, 64, 128  # neurons that a FullyFusedMLP can have
 PADDED = {"FullyFusedMLP": 16, "CutlassMLP": 8}
 """Up to multiples of what inputs and outputs are filled."""
+MOST_VERTICES = 1 << 24
+"""Along an axis of a grid's level."""
 
 
 def padded(count: int, by: int) -> int:
@@ -66,6 +68,8 @@ def levels_of(count: int, log2_rows: int, base: int, log2_growth: float, kind: s
     for level in range(count):
         grown = single(np.exp2, np.float32(level) * np.float32(log2_growth))
         scale = grown * np.float32(base) - np.float32(1)
+        if not scale < MOST_VERTICES:
+            raise FormatError(f"a level of {scale:g} vertices along an axis is not read")
         side = int(np.ceil(scale)) + 1
         rows = padded(side**3, 8) if most is None else min(padded(side**3, 8), most)
         if rows > 1 << 26:

@@ -28,7 +28,7 @@ def read(checkpoint) -> Imported:
     entries = Entries(checkpoint.entries)
     kwargs = entries.inside("kwargs")
     state = split(entries.inside("state_dict"), kwargs)
-    planes = any(name.startswith("density_plane.") for name in state.values)
+    planes = any(str(name).startswith("density_plane.") for name in state.values)
     density, resolution, _ = factors(state, "density", planes)
     colour, colour_resolution, ranks = factors(state, "app", planes)
     if resolution != colour_resolution:

@@ -376,6 +376,8 @@ def grown_to(finest: float, held: Sequence[int]) -> list[dict]:
     growth, levels = np.float32(np.log2(power)), []
     for level, rows in enumerate(held):
         scale = tcnn.single(np.exp2, np.float32(level) * growth) * np.float32(BASE) - np.float32(1)
+        if not scale < tcnn.MOST_VERTICES:
+            return []
         side = int(np.ceil(scale)) + 2
         sizes = [n**3 for n in (side, int(np.ceil(BASE * power**level)) + 1)]
         if rows not in (*sizes, *map(eight, sizes)) and not (rows == max(held) and rows < min(sizes)):

@@ -190,7 +190,7 @@ def answers(model: Model, params: dict, points: np.ndarray, dirs: np.ndarray, ti
         mixed = codes[i] if i == time else (1 - time + i) * codes[i] + (time - i) * codes[i + 1]
         return np.tile(mixed, (len(points), 1))
 
-    code, moved = code_of(params["warp_embed"]), points
+    code, moved = code_of(params.get("warp_embed")), points
     if model.pushed:
         field = params["warp_field"]["mlp"]
         h = hidden(field, np.concatenate([posenc(points, 3, False, warp_alpha), code], 1))
@@ -280,6 +280,18 @@ def test_static_and_dynamic_fields_answer_by_d2nerfs_formulas(model, time, tmp_p
     np.testing.assert_allclose(dynamic[1], expected["rgb_dynamic"], atol=1e-4)
     assert imported.rule == "add" and [node.suffix for node in imported.nodes] == ["-static", "-dynamic"]
     assert any("shadow" in note for note in imported.notes) == bool(model.shadow)
+
+
+def test_without_a_warp_or_a_coordinate_nothing_is_held_for_them(tmp_path):
+    """Flax holds no codes that nothing reads."""
+    model, (points, dirs) = Model(warp=False, hyper="", shadow=""), samples()
+    imported = d2nerf.read(written(model, tmp_path, lambda params: params.pop("warp_embed")), BOX, 0)
+    params = parameters(model)
+    del params["warp_embed"]
+    sigma, rgb = asked(imported.nodes[1], points, dirs)
+    expected = answers(model, params, points, dirs, 0)
+    np.testing.assert_allclose(sigma, expected["sigma_dynamic"], rtol=1e-4)
+    np.testing.assert_allclose(rgb, expected["rgb_dynamic"], atol=1e-4)
 
 
 @pytest.mark.parametrize("model", [MODELS["as run"], MODELS["codes"]], ids=["as run", "codes"])
@@ -396,6 +408,14 @@ def test_settings_as_gin_writes_them_are_read(tmp_path):
     np.testing.assert_allclose(
         asked(imported.nodes[1], points, dirs)[0], expected["sigma_dynamic"], rtol=1e-4
     )
+
+
+def test_settings_that_are_no_numbers_are_named(tmp_path):
+    written(MODELS["as run"], tmp_path)
+    (tmp_path / "options.json").unlink()
+    (tmp_path / "config.gin").write_text(GIN + "NerfModel.hyper_point_max_deg = 1e999\n")
+    with pytest.raises(FormatError, match="hyper_point_max_deg' should be a number, found inf"):
+        d2nerf.read(open_checkpoint(tmp_path / "checkpoint_9"), BOX, 1)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from formats.errors import FormatError
 from formats.foreign.systems import open_checkpoint
 from fusedrf_cli.bridge.importing import dvgo
+from fusedrf_cli.bridge.importing.parts import LLFF
 from fusedrf_cli.main import cli
 from fusedrf_cli.python import open_scene, verbs
 from tests.bridge.importing.asked import (
@@ -421,3 +422,11 @@ def test_an_opacity_that_is_none_is_named(tmp_path):
     path = saved(MODELS["without classes"], tmp_path, in_kwargs(alpha_init=1.0))
     with pytest.raises(FormatError, match="'alpha_init' should be between 0 and 1, found 1"):
         dvgo.read(open_checkpoint(path))
+
+
+def test_an_llff_capture_is_said_to_have_been_moved(tmp_path):
+    """By load_llff.py, which moves and scales cameras; other loaders take them as they are."""
+    path = saved(Model(), tmp_path)
+    for kind in ("llff", "blender"):
+        (tmp_path / "config.py").write_text(f"data = dict(datadir='./x', dataset_type='{kind}')\n")
+        assert (LLFF in dvgo.read(open_checkpoint(path)).notes) == (kind == "llff")

@@ -290,6 +290,7 @@ def test_the_command_writes_what_it_shows(tmp_path):
         ("encoding.hash", "ReversedPrime", "'hash' should be CoherentPrime, found 'ReversedPrime'"),
         ("encoding.type", "Tiled", "a tiled grid of"),
         ("encoding.interpolation", "Smoothstep", "'interpolation' should be Linear"),
+        ("encoding.per_level_scale", 1e12, "vertices along an axis is not read"),
         ("encoding.n_levels", 99, "'n_levels' should be a whole number from 1 to 32, found 99"),
         ("dir_encoding.nested", [{"otype": "Frequency"}], "SphericalHarmonics of degree 4, found Frequency"),
         ("snapshot.params_binary", bytes(600), "'params_binary' has 300 numbers"),

@@ -16,6 +16,7 @@ from formats.errors import FormatError
 from formats.foreign.systems import open_checkpoint
 from formats.views import View
 from fusedrf_cli.bridge.importing import nerf
+from fusedrf_cli.bridge.importing.parts import LLFF
 from fusedrf_cli.main import cli
 from fusedrf_cli.python import open_scene
 from tests.bridge.importing.asked import (
@@ -223,7 +224,7 @@ def test_without_a_box_nothing_is_written(words, said, tmp_path):
 
 def test_a_run_in_normalised_device_coordinates_is_said_to_be(tmp_path):
     path = save_nerf(Net(depth=2), tmp_path)
-    for no_ndc, expected in ((False, [nerf.NDC]), (True, [])):
+    for no_ndc, expected in ((False, [nerf.NDC]), (True, [LLFF])):
         (tmp_path / "args.txt").write_text(f"dataset_type = llff\nno_ndc = {no_ndc}\n")
         notes = nerf.read(open_checkpoint(path), BOX).notes
         assert [note for note in notes if note != nerf.FINE] == expected
@@ -232,10 +233,13 @@ def test_a_run_in_normalised_device_coordinates_is_said_to_be(tmp_path):
 def test_cameras_do_not_tell_a_box_in_normalised_device_coordinates(tmp_path):
     capture(tmp_path / "fern")
     path = save_nerf(Net(depth=2), tmp_path)
-    (tmp_path / "args.txt").write_text("dataset_type = llff\nno_ndc = False\n")
     near_far = "--near", 2, "--far", 6, "--cameras", tmp_path / "fern"
-    said = run("import", path, "-o", tmp_path / "a.rfpack", *near_far, code=2)
-    assert "give its box there as --aabb" in " ".join(said.split())
+    for no_ndc, because in ((False, "normalised device coordinates"), (True, "moved and scaled")):
+        (tmp_path / "args.txt").write_text(f"dataset_type = llff\nno_ndc = {no_ndc}\n")
+        said = " ".join(run("import", path, "-o", tmp_path / "a.rfpack", *near_far, code=2).split())
+        assert because in said and "give its box there as --aabb" in said
+    (tmp_path / "args.txt").write_text("dataset_type = blender\nno_ndc = True\n")
+    run("import", path, "-o", tmp_path / "a.rfpack", *near_far)
 
 
 def test_an_encoding_that_is_not_read_is_named(tmp_path):
@@ -482,6 +486,16 @@ def test_rows_of_hashnerfs_first_hash_are_refused(primes, tmp_path):
     else:
         with pytest.raises(FormatError, match="HashNeRF's first hash"):
             nerf.read_hashed(open_checkpoint(path), BOX)
+
+
+def test_hash_grids_of_more_levels_than_any_has_are_refused_before_they_are_read(tmp_path):
+    path = save_hashed(Hashed(), tmp_path)
+    held = torch.load(path)
+    row = held["embed_fn_state_dict"]["embeddings.0.weight"]
+    held["embed_fn_state_dict"] |= {f"embeddings.{i}.weight": row for i in range(1000)}
+    torch.save(held, path)
+    with pytest.raises(FormatError, match="up to 32 levels are read, found 1000"):
+        nerf.read_hashed(open_checkpoint(path), BOX)
 
 
 STATED = (

@@ -9,10 +9,12 @@ import torch
 
 from formats.bundle import OpenBundle
 from formats.errors import UnknownCheckpoint
+from formats.splats import dot_splat
 from fusedrf_cli import verbs
 from fusedrf_cli.bridge.importing.splats import shells_of
+from fusedrf_cli.bridge.memory import resident
 from fusedrf_cli.engine.kinds.planes import PlanesKind
-from fusedrf_cli.errors import InvalidInput, UsageProblem
+from fusedrf_cli.errors import InvalidInput, ResourceProblem, UsageProblem
 from fusedrf_cli.python import open_scene
 from fusedrf_cli.requests import Input
 from tests.formats.splats.writers import content, ply, sog_files, written, zipped
@@ -154,6 +156,13 @@ def test_shells_hold_every_splat_once():
     middles = rng.normal(size=(3000, 3)) * np.exp(rng.normal(0, 2, (3000, 1)))
     shells = shells_of(np.concatenate([middles - 0.01, middles + 0.01], 1))
     assert len(shells) > 1 and sorted(np.concatenate(shells)) == list(range(3000))
+
+
+def test_more_splats_than_memory_has_room_for_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(dot_splat, "gathered", None)  # which would fail
+    file = splat_file(tmp_path / "balls.splat", np.zeros((100_000, 3)))
+    with pytest.raises(ResourceProblem, match="for 100,000 splats"):
+        verbs.import_field(file, tmp_path / "balls.rfpack", memory=resident() + (200 << 20))
 
 
 def test_a_file_without_splats_is_refused(tmp_path):

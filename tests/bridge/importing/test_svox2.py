@@ -1,6 +1,7 @@
 """Plenoxels' files, written here as svox2's SparseGrid.save writes them, against its formulas in numpy."""
 
 import itertools
+import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +9,11 @@ import pytest
 import torch
 from click.testing import CliRunner
 
+from formats.captures import read_capture
 from formats.errors import FormatError, LimitExceeded
 from formats.foreign.stored import StoredTensor
 from formats.foreign.systems import open_checkpoint
+from formats.images import write_png
 from fusedrf_cli.bridge.importing import svox2
 from fusedrf_cli.main import cli
 from fusedrf_cli.python import open_scene
@@ -276,10 +279,46 @@ def test_a_forward_facing_scene_is_said_to_lie_in_ndc(tmp_path):
     imported = svox2.read(write(tmp_path / "ckpt.npz", entries_of(SAVED["harmonics"])))
     assert "NDC" in imported.notes[0]
     box = {"radius": np.array([1.4, 1.1, 1.0], np.float32), "center": np.zeros(3, np.float32)}
-    for said, notes in (("auto", 1), ("nsvf", 0)):  # by its box, unless the run says otherwise
+    for said, in_ndc in (("auto", True), ("nsvf", False)):  # by its box, unless the run says otherwise
         (tmp_path / "args.json").write_text(f'{{"dataset_type": "{said}"}}')
         imported = svox2.read(write(tmp_path / "ckpt.npz", entries_of(SAVED["harmonics"]) | box))
-        assert len(imported.notes) == notes
+        assert (imported.notes == [svox2.NDC]) == in_ndc
+
+
+def blender(folder):
+    """A capture of one photo, as NeRF's synthetic scenes lie."""
+    (folder / "train").mkdir(parents=True)
+    write_png(folder / "train/r_0.png", np.zeros((8, 8, 4), np.uint8))
+    frame = {"file_path": "./train/r_0", "transform_matrix": np.eye(4).tolist()}
+    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": [frame]}))
+    return read_capture(folder)
+
+
+@pytest.mark.parametrize(
+    "args, given, scale",
+    [
+        (None, True, 2 / 3),
+        ({"dataset_type": "nerf", "scene_scale": None}, False, 2 / 3),
+        ({"dataset_type": "auto", "scene_scale": 0.5}, True, 0.5),
+        ({"dataset_type": "auto", "scene_scale": 0.5}, False, 1),  # which could be of another loader
+        ({"dataset_type": "nsvf", "scene_scale": 0.5}, True, 1),
+        (None, False, 1),
+    ],
+)
+@pytest.mark.parametrize("name", ["harmonics", "background"])
+def test_a_field_is_as_large_as_the_capture_it_was_learnt_from(name, args, given, scale, tmp_path):
+    """svox2's Blender loader multiplies camera positions by its scene_scale, 2/3 unless told otherwise."""
+    entries = entries_of(SAVED[name])
+    if args is not None:
+        (tmp_path / "args.json").write_text(json.dumps(args))
+    capture = blender(tmp_path / "lego") if given else None
+    imported = svox2.read(write(tmp_path / "a.npz", entries), capture)
+    for formula, node in zip((inside_of, around_of), imported.nodes, strict=False):
+        points, dirs = asked(entries, 200, 1.2 if formula is inside_of else 3.0)
+        sigma, rgb = of_all(formula, entries, points, dirs)
+        agree(answers(node, points / scale, dirs), (sigma * scale, rgb))
+    (note,) = imported.notes
+    assert ("scaled back" in note) == (scale != 1) and ("--cameras" in note) == (scale == 1 and not given)
 
 
 def test_nothing_dense_is_an_empty_field(tmp_path):

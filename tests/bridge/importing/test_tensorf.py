@@ -322,6 +322,12 @@ def test_what_is_wrong_with_a_file_is_named_and_nothing_is_written(change, said,
     assert not (tmp_path / "a.rfpack").exists()
 
 
+def test_entries_of_other_names_are_no_part_of_it(tmp_path):
+    state = state_of(Model())
+    state = OrderedDict([(3, torch.zeros(1)), *state.items()])
+    assert tensorf.read(open_checkpoint(saved(Model(), tmp_path, state=state))).nodes
+
+
 def test_a_box_is_not_to_be_given_for_a_file_that_has_one(tmp_path):
     saved(Model(), tmp_path)
     words = "import", "scene.th", "-o", "a.rfpack", "--aabb", "-1,-1,-1,1,1,1"

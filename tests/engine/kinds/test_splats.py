@@ -141,6 +141,15 @@ def test_what_makes_no_field_is_refused(field, name, value):
         SplatsField.from_state(arrays | {name: value}, metadata)
 
 
+def test_splats_in_more_cells_than_could_be_listed_are_refused(field):
+    """60 splats that fill 384³ cells would be listed 3.4 billion times."""
+    arrays, metadata = field.state()
+    cells = {"aabb": [-1.0, -1, -1, 1, 1, 1], "counts": [384] * 3}
+    large = arrays | {"scales": np.full((60, 3), 10, np.float32)}
+    with pytest.raises(ValueError, match="in at most 536,870,912 cells, found 3,397,386,240"):
+        SplatsField.from_state(large, metadata | {"cells": cells})
+
+
 def test_splats_that_no_cell_shows_are_left_out(field):
     """And the others show the same."""
     half = field.occupancy.occupied.copy()

@@ -397,6 +397,16 @@ def test_what_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
         read_torch(tmp_path / "a.pth")
 
 
+def test_what_uses_a_storage_over_and_over_is_refused(tmp_path):
+    """Each tensor reads the whole of what it is stored in, some twice."""
+    base = torch.zeros(100_000)
+    torch.save({str(i): base[i : i + 10] for i in range(200)}, tmp_path / "a.pth")
+    held = read_torch(tmp_path / "a.pth")
+    assert all(len(held[str(i)].array()) == 10 for i in range(50))
+    with pytest.raises(LimitExceeded, match="over and over"):
+        [tensor.array() for tensor in held.values()]
+
+
 def test_members_that_lie_about_their_size_are_refused(tmp_path):
     path = tmp_path / "a.pth"
     packed = torch_zip(pickle.dumps({"a": "x" * 5000}, 2), method=zipfile.ZIP_DEFLATED)

@@ -7,6 +7,7 @@ import pytest
 
 from formats.errors import BadSplats
 from formats.splats.reading import is_splats, read_splats
+from formats.splats.splats import admitted
 from formats.splats.spz import UNSTATED
 from tests.formats.splats import writers
 from tests.formats.splats.writers import content, written
@@ -168,3 +169,22 @@ def test_meshes_are_no_splats(tmp_path):
 
     assert not any(is_splats(make(tmp_path / make.__name__)) for make in (glb, gltf, ply, ply_text))
     assert not is_splats(Gltf().write(tmp_path / "square.glb"))
+
+
+class Refused(Exception):
+    """Stands for memory that there is not."""
+
+
+@pytest.mark.parametrize("made, degree, _", FORMATS.values(), ids=FORMATS)
+def test_how_many_there_are_is_asked_before_they_are_read(made, degree, _, tmp_path):
+    path, counts = written(tmp_path / "a", made(content(7, degree))), []
+    with admitted(counts.append):
+        read_splats(path)
+    assert 7 in counts
+
+    def refuse(count: int) -> None:
+        raise Refused
+
+    with admitted(refuse), pytest.raises(Refused):
+        read_splats(path)
+    assert len(read_splats(path)) == 7

@@ -29,6 +29,9 @@ MOST_CELLS = 384
 """Along the longest side."""
 PER_SPLAT = 120
 """Cells that a splat may be in, on the mean: with more, cells are made larger."""
+MOST_PER_SPLAT, MOST_IN_CELLS = 512, 1 << 29
+"""Cells that a splat of a file may be in, on the mean, or all of them together, whichever is more: that 8³
+cells have, and what a few large ones that were cut out of many may be in."""
 
 PAIRS = 1 << 22
 """Points times splats of the reference at once."""
@@ -54,10 +57,11 @@ class SplatsField(ComputedField):
         cells: OccupancyGrid | None = None,
     ):
         """cells: the grid that tells which splats are where, occupied or not; None: as suits them. occupancy
-        None: where there are any."""
+        None: where there are any. Raises ValueError where splats are in far more cells than they may be."""
         self.centres, self.scales, self.rotations = centres, scales, rotations
         self.opacities, self.harmonics = opacities, harmonics
         self.cells = cells or cells_for(self)
+        check_spans(self)
         self.first, self.members = members_of(centres, self.axes, self.extents, self.cells, self.step)
         self.params = torch.from_numpy(rows_of(self))
         held = (np.diff(self.first) > 0).reshape(self.cells.occupied.shape)
@@ -275,6 +279,16 @@ def boxes_of(field: SplatsField) -> np.ndarray:
     """(N, 6) around each splat as far as it reaches; minima above maxima of one that is never drawn."""
     wide = np.einsum("nka,nk->na", np.abs(field.axes), field.extents)
     return np.concatenate([field.centres - wide, field.centres + wide], 1)
+
+
+def check_spans(field: SplatsField) -> None:
+    """Raise ValueError where splats are in more cells than could be listed in reasonable time and memory."""
+    cells = field.cells
+    edges = (boxes_of(field)[field.radius > 0].reshape(-1, 2, 3) - cells.aabb[:3]) / cells.cell
+    first, last = np.clip(np.floor(edges), 0, np.array(cells.occupied.shape) - 1).transpose(1, 0, 2)
+    spanned, most = (last - first + 1).prod(1).sum(), max(MOST_PER_SPLAT * len(edges), MOST_IN_CELLS)
+    if spanned > most:
+        raise ValueError(f"splats should be in at most {most:,} cells, found {spanned:,.0f}")
 
 
 def cells_for(field: SplatsField) -> OccupancyGrid:
