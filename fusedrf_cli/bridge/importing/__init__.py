@@ -52,7 +52,7 @@ BOXLESS = "nerf-pytorch", "krrish-nerf", "hashnerf", "d2nerf"
 """Systems whose files have no box."""
 MOVING = "k-planes", "d2nerf"
 """Systems whose scenes may move."""
-MOVED = "nerfacto", "splatfacto", "svox2"
+MOVED = "nerfacto", "splatfacto", "svox2", "pvd"
 """Systems of which a run or a capture tells how they moved its cameras."""
 SPLATS = "splatfacto", "gsplat", "3dgs"
 """Systems whose scenes are Gaussian splats."""
@@ -143,7 +143,7 @@ def imported_from(
     given |= {"capture": capture} if checkpoint.system in MOVED else {}
     try:
         imported = read(checkpoint, **given)
-    except (FormatError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError) as error:
+    except (FormatError, ValueError, ArithmeticError, LookupError) as error:
         where = "" if str(error).startswith(f"{checkpoint.path}: ") else f"{checkpoint.path}: "
         cure = f"copy it again, or save it with {SYSTEMS[checkpoint.system].title} as it is published"
         raise InvalidInput(f"{where}{error}" + ("" if "; " in str(error) else f"; {cure}")) from error

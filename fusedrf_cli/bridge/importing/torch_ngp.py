@@ -10,6 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from formats.errors import FormatError
+from formats.splats.splats import UP_Y, UP_Z
+from formats.views import Capture
 from fusedrf_cli.bridge.importing import tcnn, tensorf
 from fusedrf_cli.bridge.importing.cells import cells_of_bits, cropped, nodes_of
 from fusedrf_cli.bridge.importing.nerf import frequencies_of, joined, skipping
@@ -62,8 +64,9 @@ def read(checkpoint) -> Imported:
     return hashed(checkpoint, model, EXPONENTS)
 
 
-def read_pvd(checkpoint) -> Imported:
-    """The field of a checkpoint of PVD. Raises FormatError."""
+def read_pvd(checkpoint, capture: Capture | None = None) -> Imported:
+    """The field of a checkpoint of PVD; where its capture is given, and its run's settings say how that was
+    scaled, where the capture lies. Raises FormatError."""
     model = Entries(checkpoint.entries).inside("model")
     settings = checkpoint.beside.get("args.txt")
     limits, of_colours = limits_of(Entries(settings or {}, "args.txt: "))
@@ -75,7 +78,23 @@ def read_pvd(checkpoint) -> Imported:
         made = planes(checkpoint, model, "harmonics", of_planes(settings, limits), of_colours)
     else:
         made = network(checkpoint, model, limits)
-    return made if settings else replace(made, notes=[*made.notes, RECIPE])
+    if settings is None:
+        return replace(made, notes=[*made.notes, RECIPE])
+    return made if capture is None or "scale" not in settings else in_capture(made, settings)
+
+
+def in_capture(made: Imported, settings: dict) -> Imported:
+    """A field moved to where its capture's y, z, x are, which PVD's loader makes its own axes and scales.
+    Raises FormatError."""
+    scale = Entries(settings, "args.txt: ").number("scale")
+    if not 1e-6 < scale < 1e6:
+        raise FormatError(f"args.txt: 'scale' should be above 0, found {scale:g}")
+    back = np.eye(4)
+    back[:3, :3] = np.eye(3)[[2, 0, 1]] / scale
+    nodes = [replace(node, object_to_world=back @ node.object_to_world) for node in made.nodes]
+    said = f"it lies where its capture does: its axes, and its scale of {scale:g} by args.txt, are undone"
+    notes = [said if note == FRAME else note for note in made.notes]
+    return replace(made, nodes=nodes, notes=notes, up=UP_Z)
 
 
 def limits_of(settings: Entries) -> tuple[tuple[float, float], tuple[float, float] | None]:
@@ -306,7 +325,7 @@ def finished(
         notes.append("its network of what lies behind the scene (bg_net) is left out")
     if not all(map(operator.is_, shown, grids)):
         notes.append("it is cut to the box that the system's pictures show (aabb_infer)")
-    return Imported(nodes_of(field, cells, np.eye(4), of_texels), notes)
+    return Imported(nodes_of(field, cells, np.eye(4), of_texels), notes, up=UP_Y)  # the capture's z
 
 
 def bound_of(model: Entries) -> float:

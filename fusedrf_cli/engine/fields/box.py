@@ -10,16 +10,14 @@ import torch
 
 from fusedrf_cli.engine.fields import large_pages
 from fusedrf_cli.engine.fields.base import FieldMemory, check_samples, sampling_step
+from fusedrf_cli.engine.fields.cell_bits import few_cells, packed_bits, unpack_bits
 from fusedrf_cli.engine.fields.computed import (
-    FEW_CELLS,
     PER_CELL,
     PER_CELL_MADE,
     ComputedField,
     Group,
     Reads,
-    packed_bits,
     runs_of,
-    unpack_bits,
 )
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.stored_rows import StoredRows, StoredRowsConfig, folded, unfolded
@@ -238,7 +236,8 @@ class BoxField(ComputedField):
             name, packed = self.stored_name(part.name), self.pack(part, view.detach().cpu()).numpy()
             arrays |= folded(name, packed) if part.name == self.hashed_part else {name: packed}
         held = self.hashed_part is not None and runs_of(self.stored_name(self.hashed_part)) in arrays
-        arrays |= packed_bits("occupancy", self.occupancy.occupied, 0 if held else FEW_CELLS)
+        few = 0 if held else few_cells(sum(array.size for array in arrays.values()))
+        arrays |= packed_bits("occupancy", self.occupancy.occupied, few)
         needs = ["held", "runs"] if held else [] if "occupancy" in arrays else ["held"]
         metadata = ({"needs": needs} if needs else {}) | {
             "aabb": self.box.tolist(),

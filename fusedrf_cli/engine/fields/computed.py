@@ -27,9 +27,6 @@ from fusedrf_cli.engine.kernels.loops import (
 )
 from fusedrf_cli.engine.kernels.primitives import FARTHEST
 
-BRICK = 4  # cells a side
-FEW_CELLS = 1 << 22
-"""Of a grid up to which files have its bits one after the other: no grid of a fit has more."""
 StoredAs = Callable[[np.ndarray, str, np.ndarray | None], np.ndarray]
 """The numbers that an array (V, C) comes back with from a bundle: of the array, its name and the lengths of
 the runs of its rows, or None."""
@@ -383,59 +380,3 @@ def as_array(values: np.ndarray | torch.Tensor, kind: np.dtype) -> np.ndarray:
     """A tensor or an array as an array of a type, one row after the other; not copied where it is one."""
     values = values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else values
     return np.ascontiguousarray(values, kind)
-
-
-def packed_bits(name: str, grid: np.ndarray, least: int = FEW_CELLS) -> dict[str, np.ndarray]:
-    """The arrays of a grid (X, Y, Z) bool of that name: its bits; of more than `least` cells, where that is
-    less, for bricks of BRICK cells a side whether they have any and whether they have all, and the bits of
-    the others."""
-    packed = {name: np.packbits(grid)}
-    if grid.size <= least:
-        return packed
-    bricks = in_bricks(np.pad(grid, [(0, -n % BRICK) for n in grid.shape], "edge"))
-    some, full = bricks.any(1), bricks.all(1)
-    mixed = np.packbits(bricks[some & ~full], axis=1)
-    parts = {f"{name}.bricks": np.packbits(np.stack([some, full])), f"{name}.mixed": mixed}
-    # Bricks are worth it up to three quarters of the bytes of all bits.
-    return parts if sum(part.nbytes for part in parts.values()) < 0.75 * packed[name].nbytes else packed
-
-
-def in_bricks(grid: np.ndarray) -> np.ndarray:
-    """(N, BRICK³) the cells of each brick of a grid of whole ones."""
-    x, y, z = (n // BRICK for n in grid.shape)
-    cells = grid.reshape(x, BRICK, y, BRICK, z, BRICK)
-    return cells.transpose(0, 2, 4, 1, 3, 5).reshape(x * y * z, BRICK**3)
-
-
-def unpack_bits(arrays: dict[str, np.ndarray], name: str, shape: list[int]) -> np.ndarray:
-    """Inverse of `packed_bits` for the named array, a grid of a known shape. Raises ValueError naming it."""
-    count = int(np.prod(shape))
-    packed = arrays.get(name)
-    if packed is None and f"{name}.bricks" in arrays:
-        return unpacked_bricks(arrays[f"{name}.bricks"], arrays.get(f"{name}.mixed"), name, shape)
-    if packed is None or packed.shape != (-(-count // 8),):
-        have = "nothing" if packed is None else list(packed.shape)
-        raise ValueError(
-            f"array '{name}' should have shape {[-(-count // 8)]} for a grid of {shape}, found {have}"
-        )
-    return np.unpackbits(packed, count=count).reshape(shape).view(bool)
-
-
-def unpacked_bricks(marks: np.ndarray, mixed: np.ndarray | None, name: str, shape: list[int]) -> np.ndarray:
-    """(X, Y, Z) bool of the bricks of a grid. Raises ValueError where they are not its."""
-    most = 1 << 26
-    if np.prod(shape, dtype=float) > most:
-        raise ValueError(f"array '{name}' is of {shape} cells, but at most {most:,} are read")
-    counts = [-(-n // BRICK) for n in shape]
-    number = int(np.prod(counts))
-    if marks.dtype != np.uint8 or marks.shape != (-(-number // 4),):
-        raise ValueError(f"array '{name}.bricks' should be {-(-number // 4)} bytes for a grid of {shape}")
-    some, full = np.unpackbits(marks, count=2 * number).reshape(2, number).astype(bool)
-    some &= ~full
-    if mixed is None or mixed.dtype != np.uint8 or mixed.shape != (some.sum(), BRICK**3 // 8):
-        raise ValueError(f"array '{name}.mixed' should have {some.sum()} rows of {BRICK**3 // 8} bytes")
-    bricks = np.zeros((number, BRICK**3), bool)
-    bricks[full] = True
-    bricks[some] = np.unpackbits(mixed, axis=1)
-    cells = bricks.reshape(*counts, BRICK, BRICK, BRICK).transpose(0, 3, 1, 4, 2, 5)
-    return cells.reshape([n * BRICK for n in counts])[tuple(slice(n) for n in shape)].copy()

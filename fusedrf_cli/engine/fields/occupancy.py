@@ -9,6 +9,7 @@ from types import ModuleType
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.fields.cell_bits import few_cells, most_bits, saves
 from fusedrf_cli.engine.kernels import GridArrays
 from fusedrf_cli.engine.kernels.field_free import mark_cells
 from fusedrf_cli.engine.settings import current
@@ -64,6 +65,16 @@ class OccupancyGrid:
     def cell(self) -> np.ndarray:
         """(3,) size of a cell, in units of the frame."""
         return (self.aabb[3:] - self.aabb[:3]) / self.occupied.shape
+
+    def stored_bits(self, numbers: int) -> int:
+        """At most so many bits for its cells, or for some of them, in a file beside so many numbers."""
+        cells = self.occupied.size
+        bricks = cells > few_cells(numbers) and saves(self._most_bits, cells)
+        return self._most_bits if bricks else cells
+
+    @cached_property
+    def _most_bits(self) -> int:
+        return most_bits(self.occupied)
 
     @cached_property
     def skip(self) -> np.ndarray:

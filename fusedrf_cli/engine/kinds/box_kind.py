@@ -17,6 +17,7 @@ from fusedrf_cli.engine.kinds.builder import (
     Section,
     StorageSetting,
     finest_within,
+    numbers_in,
 )
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.reduction import Reduction, coarser
@@ -101,7 +102,8 @@ class BoxKind(Kind):
             return small if shape == field.shape else self.with_bands(small, shape)
 
         lossless = same and shape == outline.shape
-        return Reduction(Contents(sections, outline.occupancy.occupied.size), make, lossless)
+        cells = outline.occupancy.stored_bits(numbers_in(sections))
+        return Reduction(Contents(sections, cells), make, lossless)
 
     def with_bands(self, field: BoxField, shape: object) -> BoxField:
         """A field with the first of its SH bands, as many as another shape has: a colour basis (3, bands,

@@ -3,6 +3,7 @@
 Bytes are told by whoever knows files (`StoredSizes`): nothing here does.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
@@ -102,6 +103,11 @@ class Contents:
     """Tensors, say, that its metadata tell of."""
     placements: int = 1
     """Of parts in its frame."""
+
+
+def numbers_in(sections: Sequence[Section]) -> int:
+    """How many numbers are stored."""
+    return sum(math.prod(section.shape) for section in sections)
 
 
 class StoredSizes(Protocol):
@@ -325,7 +331,7 @@ class DistilledBuilder:
             raise TooSmall(smallest)
         sizes = self.request.sizes
         bare = self.request.overhead + sizes.of(
-            Contents((), self.scene.occupancy.occupied.size), storage.precision
+            Contents((), self.scene.occupancy.stored_bits(0)), storage.precision
         )
         numbers = max(1, int((limit - bare) / sizes.per_number(storage.precision)))
         # small planes are not coded
@@ -339,7 +345,7 @@ class DistilledBuilder:
 
     def bytes_of_plan(self, plan: Plan, storage: StorageSetting) -> int:
         """At most so many bytes of the file."""
-        contents = plan.contents(self.scene.occupancy.occupied.size)
+        contents = plan.contents(self.scene.occupancy.stored_bits(numbers_in(plan.sections)))
         return self.request.overhead + self.request.sizes.of(contents, storage.precision)
 
     # -- beginning -------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """torch-ngp's and PVD's checkpoints, written here as their trainers write them, against their formulas."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -306,6 +307,22 @@ def test_pvd(name, tmp_path):
     found = oracle.answers(imported, points, d)
     oracle.assert_alike(found, expected(model, state_of(model, True), points, d, True))
     assert any("between -2 and 7" in note for note in imported.notes) == (not model.args)
+
+
+@pytest.mark.parametrize("kind", ["hash", "tensors"])
+def test_pvd_lies_where_its_capture_does(kind, tmp_path):
+    """nerf_matrix_to_ngp takes a camera's y, z, x times the run's scale."""
+    model = replace(PVD[kind], args={"scale": 0.8, "mode": "blender"})
+    checkpoint, (points, d) = written(model, tmp_path, True), places(model)
+    own = torch_ngp.read_pvd(checkpoint)
+    assert torch_ngp.FRAME in own.notes and own.up == (0, 1, 0)
+    imported = torch_ngp.read_pvd(checkpoint, SimpleNamespace(kind="blender"))
+    x, y, z = (points / 0.8)[:, [2, 0, 1]].T  # of the capture, of which the model's are y, z, x
+    assert np.allclose(np.stack([y, z, x], 1) * 0.8, points)
+    sigma, rgb = oracle.answers(imported, np.stack([x, y, z], 1), d[:, [2, 0, 1]])
+    expect = expected(model, state_of(model, True), points, d, True)
+    oracle.assert_alike((sigma / 0.8, rgb), expect)
+    assert torch_ngp.FRAME not in imported.notes and imported.up == (0, 0, 1)
 
 
 def test_cells_of_spring_2022_are_refused(tmp_path):

@@ -5,10 +5,10 @@ import math
 import torch
 
 from fusedrf_cli.engine.encodings.hash_grid import FINER
-from fusedrf_cli.engine.fields.computed import packed_bits
+from fusedrf_cli.engine.fields.cell_bits import packed_bits
 from fusedrf_cli.engine.fields.stored_rows import StoredRows
 from fusedrf_cli.engine.kinds.box_kind import BoxKind
-from fusedrf_cli.engine.kinds.builder import Contents, Plan, Section, StorageSetting
+from fusedrf_cli.engine.kinds.builder import Contents, Plan, Section, StorageSetting, numbers_in
 from fusedrf_cli.engine.kinds.hash.field import BASE, ROWS, HashConfig, HashField, HashShape
 from fusedrf_cli.engine.kinds.hash.trimming import rows_used, with_fewer_rows, without_unasked
 from fusedrf_cli.engine.kinds.reduction import Reduction
@@ -73,10 +73,10 @@ class HashKind(BoxKind):
 
 def contents_of(field: HashField, held: StoredRows) -> Contents:
     """What a field of those rows alone is stored with."""
-    cells, bits = field.occupancy.occupied, field.occupancy.occupied.size
     sections = [Section(part.name, field.stored_shape(part)) for part in field.parts]
+    bits = field.occupancy.stored_bits(numbers_in(sections))
     if held.saves(field.shape.features):
-        bits = 8 * sum(array.nbytes for array in packed_bits("", cells, 0).values())
+        bits = 8 * sum(array.nbytes for array in packed_bits("", field.occupancy.occupied, 0).values())
         bits += held.told(field.shape.features)
         few = held.count, field.shape.features
         sections = [Section(s.name, few) if s.name == ROWS else s for s in sections]

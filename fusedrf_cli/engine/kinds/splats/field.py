@@ -9,13 +9,12 @@ import torch
 
 from fusedrf_cli.engine.fields.base import FieldMemory
 from fusedrf_cli.engine.fields.box import LINE, checked_box, whole_numbers
+from fusedrf_cli.engine.fields.cell_bits import few_cells, packed_bits, unpack_bits
 from fusedrf_cli.engine.fields.computed import (
     PER_CELL,
     PER_CELL_MADE,
     ComputedField,
     Reads,
-    packed_bits,
-    unpack_bits,
 )
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts
 from fusedrf_cli.engine.kernels.reference import sh_basis
@@ -184,7 +183,8 @@ class SplatsField(ComputedField):
         metadata = {"splats": len(self.centres), "cells": cells}
         as_held = np.array_equal(self.occupancy.occupied.ravel(), np.diff(self.first) > 0)
         if not (as_held and np.array_equal(self.occupancy.aabb, self.box)):
-            arrays |= packed_bits("occupancy", self.occupancy.occupied)
+            few = few_cells(sum(array.size for array in arrays.values()))
+            arrays |= packed_bits("occupancy", self.occupancy.occupied, few)
             metadata["occupancy"] = {
                 "aabb": self.occupancy.aabb.tolist(), "counts": list(self.occupancy.occupied.shape)
             }  # fmt: skip

@@ -21,6 +21,7 @@ from fusedrf_cli.engine.kinds.builder import (
     StorageSetting,
     Suitability,
     finest_within,
+    numbers_in,
 )
 from fusedrf_cli.engine.kinds.reduction import Reduction, coarser
 from fusedrf_cli.engine.kinds.vm.field import DETAIL, VMField, VMShape
@@ -227,7 +228,7 @@ def add_noise(student: VMField, generator: torch.Generator) -> None:
 def contents_of(field: VMField, held: StoredRows | None) -> Contents:
     """What a field without unread texels (trimming.py) is stored with, whatever its numbers are; held: which
     rows of its hash grid."""
-    sections, bits = [], field.occupancy.occupied.size + 8  # packed by itself
+    sections, bits = [], 8  # packed by itself
     for part in field.parts:
         used = read_texels(field, int(part.name[-1])) if "_plane_" in part.name else None
         shape = part.shape
@@ -235,4 +236,4 @@ def contents_of(field: VMField, held: StoredRows | None) -> Contents:
             shape = held.count, ROW
             bits += held.told(ROW)
         sections.append(Section(part.name, shape, used))
-    return Contents(sections, bits)
+    return Contents(sections, bits + field.occupancy.stored_bits(numbers_in(sections)))

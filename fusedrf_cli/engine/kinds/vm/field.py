@@ -19,12 +19,11 @@ from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.assembled import AssembledField, RankedShape, Slot
 from fusedrf_cli.engine.fields.base import FieldMemory
 from fusedrf_cli.engine.fields.box import LINE, checked_box, whole_numbers
+from fusedrf_cli.engine.fields.cell_bits import few_cells, packed_bits
 from fusedrf_cli.engine.fields.computed import (
-    FEW_CELLS,
     PER_CELL,
     PER_CELL_MADE,
     Reads,
-    packed_bits,
     runs_of,
 )
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
@@ -37,8 +36,6 @@ from fusedrf_cli.engine.spaces import bounded, name_of
 class VMConfig:
     """How a field of planes and lines learns and is stored."""
 
-    cells_per_number: int = 4
-    """Of a field, from which on its cells are stored in bricks where these are smaller."""
     basis_rate: float = 0.15
     """Of the factors'; at a third of it, as in TensoRF, a fox after a minute shows 0.5 dB less."""
 
@@ -121,7 +118,7 @@ class VMField(AssembledField):
         """See BoxField."""
         arrays = self.numbers()
         hashed, held = self.shape.hashed, runs_of(self.stored_name(DETAIL)) in arrays
-        few = 0 if held else min(FEW_CELLS, current(VMConfig).cells_per_number * self.size)
+        few = 0 if held else few_cells(sum(array.size for array in arrays.values()))
         cells = packed_bits(self.stored_name("occupancy"), self.occupancy.occupied, few)
         needs = {"hashed"} if hashed else set()
         needs |= ({"held", "runs"} if held else set()) | ({"held"} if len(cells) > 1 else set())
