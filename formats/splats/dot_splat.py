@@ -23,7 +23,7 @@ FARTHEST, SMALLEST, LARGEST = 1e7, 1e-12, 1e5
 
 def is_splat(head: bytes, size: int) -> bool:
     """Whether a file of `size` bytes that begins so can be one."""
-    if not size or size % ROW.itemsize:
+    if size < ROW.itemsize:
         return False
     rows = np.frombuffer(head, ROW, min(len(head) // ROW.itemsize, SAMPLE))
     likely = (np.abs(rows["centre"]) < FARTHEST).all(1)

@@ -72,7 +72,7 @@ def is_ksplat(head: bytes, size: int) -> bool:
     if len(head) < HEADER + SECTION or any(head[FIELDS.size : HEADER]):
         return False
     major, minor, zero, sections, _, _, count, level, *_ = FIELDS.unpack_from(head)
-    likely = (major, zero) == (0, 0) and minor >= 1 and level <= 2 and count > 0
+    likely = (major, zero) == (0, 0) and minor >= 1 and level < 10 and count > 0
     return likely and 1 <= sections <= MAX_SECTIONS and HEADER + SECTION * sections < size
 
 
@@ -80,6 +80,8 @@ def read_ksplat(path: Path | str, data: bytes) -> Splats:
     """Raises BadSplats, LimitExceeded."""
     _, _, _, n_sections, _, _, count, level, *_, least, largest = FIELDS.unpack_from(data)
     at = HEADER + SECTION * n_sections
+    if level > 2:
+        raise BadSplats(f"{path}: states compression level {level}, and 0 to 2 are read; save it as a .ply")
     sections = [_section(data, HEADER + SECTION * i, level) for i in range(n_sections)]
     if any(section.degree > 3 for section in sections):
         raise BadSplats(f"{path}: states harmonics of a degree above 3; export it again")

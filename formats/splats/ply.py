@@ -27,7 +27,7 @@ from formats.splats.splats import (
 )
 
 HEADER = re.compile(
-    rb"ply[\r\n](?=.*property \S+ scale_0\b)(?=.*property \S+ rot_0\b)(?=.*property \S+ opacity\b)|"
+    rb"ply[\r\n](?=.*property \S+ scale_0\b)(?=.*property \S+ (?:rot_0|opacity)\b)|"
     rb"ply[\r\n](?=.*property \S+ packed_position\b)(?=.*property \S+ packed_rotation\b)",
     re.DOTALL,
 )

@@ -18,11 +18,11 @@ MAX_NAME = 1024
 
 
 class Beside:
-    """Opens what a mesh names. Nothing above the parent of the mesh's folder is opened, links resolved;
-    no absolute path, no address."""
+    """Opens what a mesh or a file of splats names. Nothing above the parent of its folder is opened, links
+    resolved; no absolute path, no address."""
 
     def __init__(self, path: Path | str):
-        self.folder = Path(path).parent
+        self.named_by, self.folder = Path(path).name, Path(path).parent
         self.root = os.path.realpath(self.folder / os.pardir)
         self.bytes_read = 0
 
@@ -44,10 +44,12 @@ class Beside:
 
     def find(self, name: str, *, uri: bool = False) -> Path:
         if len(name) > MAX_NAME:
-            raise MissingFile(f"{name[:80]}…: no such file beside the mesh")
+            raise MissingFile(f"{name[:80]}…: no such file beside {self.named_by}")
         name = LOCAL.sub("", name)
         if SCHEME.match(name):
-            raise OutsideFolder(f"{name}: an address, and only files beside the mesh are read; put it there")
+            raise OutsideFolder(
+                f"{name}: an address, and only files beside {self.named_by} are read; put it there"
+            )
         if uri:
             spellings = dict.fromkeys([unquote(name), name, unquote(re.split("[?#]", name)[0])])
         else:
@@ -66,7 +68,9 @@ class Beside:
                     continue
                 if path is not None:
                     return path
-        raise refused or MissingFile(f"{name}: no such file beside the mesh; put it into {self.folder}")
+        raise refused or MissingFile(
+            f"{name}: no such file beside {self.named_by}; put it into {self.folder}"
+        )
 
     def _match(self, parts: list[str]) -> Path | None:
         """The file of a path relative to the folder, each part exact or else in another case."""
@@ -89,7 +93,7 @@ class Beside:
     def _check(self, path: Path) -> None:
         real = os.path.realpath(path)
         if os.path.commonpath([real, self.root]) != self.root:
-            raise OutsideFolder(f"{path}: lies outside of {self.root}; put it beside the mesh")
+            raise OutsideFolder(f"{path}: lies outside of {self.root}; put it beside {self.named_by}")
 
 
 def _entries(folder: Path) -> list[str]:

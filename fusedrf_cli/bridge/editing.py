@@ -40,6 +40,8 @@ from fusedrf_cli.requests import (
     ReplaceRequest,
 )
 
+PLACED = "added", "moved", "duplicated"
+"""Edits that put an object where none was."""
 SAME_BITS = "an edit of the scene graph: all fields keep their bits"
 
 
@@ -187,10 +189,25 @@ class Edit:
             draft.box(before) if before else None,
         ]
         boxes += [box for box in placements if box is not None]
+        if event in PLACED:
+            self.warn_outside(objects, placements[0])
         entry = {"event": event} | ({"objects": objects} if objects else {}) | entry
         size = draft.write(self.request, entry, isinstance(self.request, Learning))
         names = objects or entry.get("names", [])
         return self.report(size, names, enclosing(boxes) if boxes else None, how)
+
+    def warn_outside(self, objects: Sequence[str], box: np.ndarray | None) -> None:
+        """A warning where objects in a box (6,) of the world will not be seen, since pictures stay as they
+        were."""
+        framing = self.draft.framing
+        if framing is None or box is None:
+            return
+        middle = (box[:3] + box[3:]) / 2
+        if not ((np.asarray(framing[:3]) <= middle) & (middle <= framing[3:])).all():
+            self.progress.warn(
+                f"{', '.join(objects)} lies outside of what pictures show, which stay as they were; "
+                f"`render --look-at {','.join(f'{x:.4g}' for x in middle)}` shows it"
+            )
 
     def report(self, size: int, names: Iterable[str], box: np.ndarray | None, how: str) -> dict:
         """The report of an edit that touched a box (6,) of the world."""

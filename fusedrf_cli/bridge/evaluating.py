@@ -17,7 +17,7 @@ from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.metrics import SSIM_WINDOW, psnr
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.settings import current
-from fusedrf_cli.errors import InvalidInput
+from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import EvaluateRequest
 
 
@@ -120,7 +120,7 @@ def capture_pairs(against: str, split: str, size: tuple[int, int] | None) -> Ite
             f"{other}"
         )
     if size is not None and size != (views[0].width, views[0].height):
-        raise InvalidInput(
+        raise UsageProblem(
             f"{against}: the photos are {views[0].width}x{views[0].height}; leave --size out to compare "
             "with them"
         )

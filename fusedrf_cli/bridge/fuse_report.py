@@ -9,6 +9,17 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.kinds.builder import DistilledBuilder
 from fusedrf_cli.engine.kinds.instances import distinct_fields
 from fusedrf_cli.errors import QualityNotReached
+from fusedrf_cli.requests import FuseRequest
+
+
+def fused_entry(
+    request: FuseRequest, kind: str, composition: str, best: BestTrial, builder: DistilledBuilder
+) -> dict:
+    """What a bundle's history tells of a fuse."""
+    settings = {"seed": request.seed, "max_size": builder.request.limit, "rgb": request.finetune}
+    settings |= {"from_scratch": request.from_scratch}
+    named = {"event": "fused", "kind": kind, "composition": composition}
+    return named | {"settings": settings, "psnr": reached_by(best, builder)}
 
 
 def reached_by(best: BestTrial, builder: DistilledBuilder) -> dict:

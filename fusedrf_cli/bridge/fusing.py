@@ -11,7 +11,7 @@ from fusedrf_cli.bridge.building import BestTrial, BuildingConfig, FuseScene, Ma
 from fusedrf_cli.bridge.bundling import FusedBundle, stored_bytes, unchanged_bytes
 from fusedrf_cli.bridge.capture_cameras import result_cameras, result_view_box
 from fusedrf_cli.bridge.cutting import cut_to_crops
-from fusedrf_cli.bridge.fuse_report import check_target, chosen_of, figures_of, reached_by
+from fusedrf_cli.bridge.fuse_report import check_target, chosen_of, figures_of, fused_entry, reached_by
 from fusedrf_cli.bridge.memory import Memory, MemoryConfig, asking_in_waves, stages, will_learn
 from fusedrf_cli.bridge.memory import sources as in_memory
 from fusedrf_cli.bridge.rendering import warn_of_work
@@ -84,7 +84,10 @@ def fuse(
         return fuse_as(request, progress, load, somewhere)
     except NodesTooLarge as error:
         progress.warn(f"{error}, more than --max-size: one field of the kind {error.kind} is learnt instead")
-        report = fuse_as(replace(request, kind=error.kind), progress, load, somewhere, nodes_fit=False)
+        try:
+            report = fuse_as(replace(request, kind=error.kind), progress, load, somewhere, nodes_fit=False)
+        except UsageProblem as neither:
+            raise UsageProblem(f"{neither}; {error}") from neither
         return report | {"kind_because": str(error)}
 
 
@@ -121,7 +124,7 @@ def fuse_as(request: FuseRequest, progress, load: Load, somewhere: Callable, nod
         pixels = current(BuildingConfig).views * current(DistilConfig).view_size ** 2
         warn_of_work(request.scene, scene.composed, pixels, progress)
         made = best_of(request, scene, kind, bundle.overhead, memory, device, progress, saved)
-        entry = history_entry(request, kind.name, loaded.composition, made)
+        entry = fused_entry(request, kind.name, loaded.composition, made.kept, made.builder)
         with without_interrupts(request.output):  # what was made comes before what is found out about it
             size = somewhere(
                 request.output, lambda output: bundle.write(output, made.kept, made.background, entry)
@@ -146,18 +149,6 @@ def fuse_as(request: FuseRequest, progress, load: Load, somewhere: Callable, nod
     }
     check_target(report, request.target_psnr, request.output)
     return report
-
-
-def history_entry(request: FuseRequest, kind: str, composition: str, made: "Candidate") -> dict:
-    """What the bundle's history tells of a fuse."""
-    return {
-        "event": "fused", "kind": kind, "composition": composition,
-        "settings": {
-            "seed": request.seed, "max_size": made.builder.request.limit, "rgb": request.finetune,
-            "from_scratch": request.from_scratch,
-        },
-        "psnr": reached_by(made.kept, made.builder),
-    }  # fmt: skip
 
 
 @dataclass(frozen=True)

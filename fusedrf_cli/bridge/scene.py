@@ -13,10 +13,10 @@ from formats.errors import FormatError
 from formats.field_header import reading_size
 from formats.nodes import Crop as ShownPart
 from formats.nodes import Leaf, check_affine
-from formats.object_summary import world_aabb
 from formats.records import FieldRecord
 from formats.scene import MAX_SCENE_BYTES, SceneGraph, parse_scene
 from formats.sources import expand_scene, inline_scenes, resolve_source
+from fusedrf_cli.bridge.crops import NothingHeld, where_held
 from fusedrf_cli.bridge.field_cache import FieldCache
 from fusedrf_cli.bridge.memory import Memory, sources
 from fusedrf_cli.engine.composition.affine import WHITE, Placed
@@ -262,7 +262,7 @@ def outlines(
     """The same to know where its visible nodes lie: a field is read when its header and its grid do not tell
     that, and held against the budget then. known: fields that were asked before, and come to be."""
     loader = _Loader(bundle.path, budget, "cpu", known)
-    return [loader.outline(*found) for found in loader.found(graph, False, bundle)]
+    return where_held(loader.outline, loader.found(graph, False, bundle))
 
 
 def load_fields(
@@ -323,7 +323,8 @@ class _Loader:
             self.budget.expect(
                 sources([*sizes.values()], self.field_cache.room) | reading, advice="use smaller sources"
             )
-        fields = tuple(self.source(leaf, b, member, needs[b, member]) for leaf, b, member in field_list)
+        with_needs = ((leaf, b, member, needs[b, member]) for leaf, b, member in field_list)
+        fields = tuple(where_held(self.source, with_needs))
         kept = tuple(self.camera_sets), tuple(self.framings)
         return LoadedScene(fields, graph.composition, graph, self.path, self.field_cache, *kept, bundle)
 
@@ -403,17 +404,8 @@ class _Loader:
         except ValueError as error:
             raise InvalidInput(f"{bundle.path}: {error}; give an invertible placement") from error
         if crops and not placed.occupancy.occupied.any():
-            raise nothing_held(f"{bundle.path}: node '{leaf.name}'", field.aabb, leaf.crops[-1])
+            raise NothingHeld(f"{bundle.path}: node '{leaf.name}'", field.aabb, leaf.crops[-1])
         return placed
-
-
-def nothing_held(where: str, box: np.ndarray, crop: ShownPart) -> InvalidInput:
-    """What says that a crop holds nothing of a field of a box (6,)."""
-    lies = ",".join(f"{number:.4g}" for number in world_aabb(box.tolist(), crop.object_to_shape))
-    return InvalidInput(
-        f"{where}: its crop holds nothing of it; in the frame of the node that is cropped it lies within "
-        f"{lies}; give a box or a sphere that reaches into that"
-    )
 
 
 def background_of(scene: LoadedScene) -> SourceField:

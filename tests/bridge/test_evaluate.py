@@ -62,7 +62,7 @@ def test_a_scene_against_itself_and_another(report):
 @pytest.mark.parametrize(
     "words, code, says",
     [
-        (("photos", "--size", "10x10"), 3, "24x24"),
+        (("photos", "--size", "10x10"), 2, "24x24"),
         (("photos", "--device", "cuda"), 5, "no GPU"),
         (("gone",), 3, "no such file"),
     ],

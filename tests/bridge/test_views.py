@@ -2,6 +2,7 @@
 
 import json
 import random
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -297,10 +298,18 @@ def test_an_edit_does_not_move_the_view(report, folder):
             assert all(same(one, other) for one, other in zip(found, wanted, strict=True)), name
 
 
-def test_an_edit_of_a_trained_field_does_not_move_the_view_either(report, folder):
+def test_an_edit_of_a_trained_field_does_not_move_the_view_either(run, report, folder):
     before = views_of(folder, "red.rfpack")[0]
-    report("add", "red.rfpack", "blue.rfpack", "--name", "far", "-t", "20,0,5", "-o", "g.rfpack")
+    added = run("add", "red.rfpack", "blue.rfpack", "--name", "far", "-t", "20,0,5", "-o", "g.rfpack")
     assert same(views_of(folder, "g.rfpack")[0], before)
+    assert "far lies outside of what pictures show" in " ".join(added.stderr.split())
+    look = re.search(r"--look-at (\S+?)`", added.stderr)[1]
+    (shown,) = views_of(folder, "g.rfpack", look_at=tuple(map(float, look.split(","))))
+    box = FIELDS["blue"].occupancy.tight_aabb(0)
+    aimed = (box[:3] + box[3:]) / 2 + [20, 0, 5] - eye_of(shown)
+    assert aimed / np.linalg.norm(aimed) @ -shown.camera_to_world[:3, 2] > 0.999
+    near = run("add", "red.rfpack", "blue.rfpack", "--name", "near", "-o", "h.rfpack")
+    assert "outside" not in near.stderr
 
 
 def test_hostile_cameras_are_refused_or_make_views_of_finite_numbers():

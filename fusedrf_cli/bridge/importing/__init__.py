@@ -63,6 +63,7 @@ UNREAD = {
     "d-nerf": "its points are moved by a network of time; train it with 'nerf_type = original'",
 }
 """Why checkpoints of a system are not read, where that is known."""
+MOST_LONG = 10_000
 COPIES = 5.5
 """Of an array, of what its field takes: read, rearranged, as numbers and as they are written."""
 
@@ -173,6 +174,9 @@ def box_of(request: ImportRequest, capture: Capture | None, checkpoint: Checkpoi
         box = np.array(request.aabb)
         if not (box[:3] < box[3:]).all():
             raise UsageProblem(f"--aabb should be three minima below three maxima, found {request.aabb}")
+        sides = box[3:] - box[:3]
+        if not sides.max() <= MOST_LONG * sides.min():
+            raise UsageProblem(f"--aabb should have no side above {MOST_LONG:,} times another, found {sides}")
         return box
     if checkpoint.system == "hashnerf":
         if request.near is not None or request.far is not None:

@@ -19,11 +19,12 @@ PER_SPLAT = 2000
 ADVICE = "close other programs, or raise --memory"
 
 MOST_SHELLS = 4
-INNER = 0.99
-"""Share of the splats that a shell's box is put around."""
-WIDER = 2.5
-"""Times as wide as that box, up to which all splats are one field: cells for those far away, or as large as
-the surroundings, would be too coarse for the others."""
+INNER = 0.8
+"""Share of the splats around which a box lies; a shell's box is its longest side wider on every side, so that
+none of a solid and few of a cloud are left out, and a tenth may lie far away on one side."""
+WIDER = 4
+"""Times as wide as the former box, up to which all splats are one field: cells for those far away, or as
+large as the surroundings, would be too coarse for the others."""
 
 
 def read(path: Path | str, memory: Memory) -> Imported:
@@ -76,15 +77,16 @@ def boxes_around(splats: Splats) -> np.ndarray:
 
 
 def shells_of(boxes: np.ndarray) -> list[np.ndarray]:
-    """The numbers of splats with boxes (N, 6), in shells: each takes those that lie in the box around nearly
-    all that are left, and the last one the rest."""
+    """The numbers of splats with boxes (N, 6), in shells: each takes those that lie in the box around most
+    that are left, and the last one the rest."""
     left, shells = np.arange(len(boxes)), []
     while len(shells) < MOST_SHELLS - 1 and len(left):
         own = boxes[left]
         low, high = np.quantile(own[:, :3], (1 - INNER) / 2, 0), np.quantile(own[:, 3:], (1 + INNER) / 2, 0)
-        if (own[:, 3:].max(0) - own[:, :3].min(0)).max() <= WIDER * (high - low).max():
+        longest = (high - low).max()
+        if (own[:, 3:].max(0) - own[:, :3].min(0)).max() <= WIDER * longest:
             break
-        inside = ((own[:, :3] >= low) & (own[:, 3:] <= high)).all(1)
+        inside = ((own[:, :3] >= low - longest) & (own[:, 3:] <= high + longest)).all(1)
         shells.append(left[inside])
         left = left[~inside]
     return [shell for shell in (*shells, left) if len(shell)]

@@ -208,6 +208,7 @@ WRONG = {
     "no cameras": (("--near", 2, "--far", 6), "does not say where its scene lies"),
     "near beyond far": (("--near", 6, "--far", 2), "--near 6 should be less than --far 2"),
     "two boxes": (("--aabb", "-1,-1,-1,1,1,1", "--far", 6), "leave out --near and --far"),
+    "a needle": (("--aabb", "0,0,0,1,1,1e9"), "no side above 10,000 times another"),
     "a box inside out": (("--aabb", "1,1,1,0,0,0"), "with each minimum below its maximum"),
 }
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from formats.bundle import OpenBundle
-from formats.errors import UnknownCheckpoint
+from formats.errors import BadSplats, UnknownCheckpoint
 from formats.splats import dot_splat
 from fusedrf_cli import verbs
 from fusedrf_cli.bridge.importing.splats import shells_of
@@ -165,6 +165,19 @@ def test_more_splats_than_memory_has_room_for_are_refused_before_they_are_read(t
         verbs.import_field(file, tmp_path / "balls.rfpack", memory=resident() + (200 << 20))
 
 
+@pytest.mark.parametrize("share", [0.001, 0.01, 0.05])
+def test_whole_objects_are_told_from_what_lies_far_away(share):
+    """Of a cloud, three of 2,000 may be as far out as what lies far away."""
+    rng = np.random.default_rng(3)
+    solid, cloud = rng.uniform(-1, 1, (2000, 3)), rng.normal(size=(2000, 3)) / 4
+    far = rng.normal(size=(int(2000 * share), 3)) + [0, 60, 0]
+    for middles in (solid, cloud, solid * [1, 1, 0.01]):
+        for others, counts in ((far[:0], [2000]), (far, [2000, len(far)])):
+            at = np.concatenate([middles, others])
+            shells = shells_of(np.concatenate([at - 0.01, at + 0.01], 1))
+            assert np.allclose([len(shell) for shell in shells], counts, atol=3)
+
+
 def test_a_file_without_splats_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("no splats")
     with pytest.raises(Exception, match="notes.txt") as caught:
@@ -219,6 +232,9 @@ def test_the_folder_of_a_sog_and_an_archive_of_splats(tmp_path):
 def test_a_file_cut_short_and_a_folder_say_what_to_do(tmp_path):
     file = splat_file(tmp_path / "balls.splat", np.zeros((3, 3)))
     file.write_bytes(file.read_bytes()[:-5])
+    with pytest.raises(BadSplats, match="91 bytes are no whole splats of 32 bytes; copy it again"):
+        verbs.import_field(file, tmp_path / "balls.rfpack")
+    file.write_bytes(b"\xff" * 91)
     with pytest.raises(
         UnknownCheckpoint, match="Gaussian splats, but cut short or of no format that is read"
     ):

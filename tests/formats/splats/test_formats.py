@@ -188,3 +188,10 @@ def test_how_many_there_are_is_asked_before_they_are_read(made, degree, _, tmp_p
     with admitted(refuse), pytest.raises(Refused):
         read_splats(path)
     assert len(read_splats(path)) == 7
+
+
+def test_a_level_of_ksplat_that_is_not_known_is_named(tmp_path):
+    data = bytearray(writers.ksplat(content(3, 0)))
+    data[20:22] = (3).to_bytes(2, "little")
+    with pytest.raises(BadSplats, match="compression level 3, and 0 to 2 are read"):
+        read_splats(written(tmp_path / "a", bytes(data)))

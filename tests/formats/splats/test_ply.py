@@ -65,6 +65,14 @@ def test_numbers_that_are_none_are_left_out_and_told(tmp_path):
     assert "5 splats have NaN, infinite or absurd numbers" in splats.notes[0]
 
 
+@pytest.mark.parametrize("lost", ["rot_0", "opacity", "rot_3"])
+def test_what_splats_lack_is_named(lost, tmp_path):
+    columns = ply_columns(content())
+    del columns[lost]
+    with pytest.raises(BadSplats, match=f"its splats lack '{lost}'; export it again"):
+        read(tmp_path, columns)
+
+
 def test_without_a_sound_splat_an_error(tmp_path):
     with pytest.raises(BadSplats, match="no splat with finite numbers"):
         read(tmp_path, ply_columns(content()) | {"x": np.full(5, np.nan)})
