@@ -96,7 +96,7 @@ imported_precision = click.option(
     type=click.Choice(get_args(Precision)),
     default="float32",
     show_default=True,
-    help="How numbers are stored.",
+    help="How numbers are stored; in int8 and int4 arrays of few numbers stay float16.",
 )
 ranks = click.option(
     "--ranks",

@@ -53,7 +53,6 @@ class Archive:
                 raise BadCheckpoint(f"{path}: not a whole ZIP archive ({error}); copy it again") from error
             size = os.fstat(file.fileno()).st_size
         self.members: dict[str, Member] = {}
-        self.read_bytes = 0
         for entry in entries:
             name = entry.filename
             if name in self.members:
@@ -73,12 +72,13 @@ class Archive:
                     f"{entry.file_size:,}, which is more than is believed"
                 )
             self.members[name] = Member(entry.header_offset, packed, entry.file_size, entry.CRC, deflated)
+        self.bytes_left = MOST_READ * sum(member.size for member in self.members.values())
 
     def read(self, name: str) -> bytes | bytearray:
         """All bytes of a member. Raises BadCheckpoint, ChecksumMismatch, LimitExceeded."""
         member = self.members[name]
-        self.read_bytes += member.size
-        if self.read_bytes > MOST_READ * sum(each.size for each in self.members.values()):
+        self.bytes_left -= member.size
+        if self.bytes_left < 0:
             raise LimitExceeded(f"{self.path}: what it holds uses member {name} and others over and over")
         with open_input(self.path) as file:
             data = self._data(file, name, member)

@@ -202,8 +202,8 @@ class Edit:
         framing = self.draft.framing
         if framing is None or box is None:
             return
-        middle = (box[:3] + box[3:]) / 2
-        if not ((np.asarray(framing[:3]) <= middle) & (middle <= framing[3:])).all():
+        middle, low, high = (box[:3] + box[3:]) / 2, *np.split(np.asarray(framing), 2)
+        if np.linalg.norm(2 * middle - low - high) > np.linalg.norm(high - low):  # pictures show a ball
             self.progress.warn(
                 f"{', '.join(objects)} lies outside of what pictures show, which stay as they were; "
                 f"`render --look-at {','.join(f'{x:.4g}' for x in middle)}` shows it"

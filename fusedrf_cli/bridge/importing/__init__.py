@@ -64,6 +64,7 @@ UNREAD = {
 }
 """Why checkpoints of a system are not read, where that is known."""
 MOST_LONG = 10_000
+"""Times as long as another side of its box one may be, of a field whose file has none."""
 COPIES = 5.5
 """Of an array, of what its field takes: read, rearranged, as numbers and as they are written."""
 

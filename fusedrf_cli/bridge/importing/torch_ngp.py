@@ -78,7 +78,7 @@ def read_pvd(checkpoint, capture: Capture | None = None) -> Imported:
         made = planes(checkpoint, model, "harmonics", of_planes(settings, limits), of_colours)
     else:
         made = network(checkpoint, model, limits)
-    if settings is None:
+    if not settings:
         return replace(made, notes=[*made.notes, RECIPE])
     return made if capture is None or "scale" not in settings else in_capture(made, settings)
 
