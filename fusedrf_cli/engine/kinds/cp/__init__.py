@@ -8,7 +8,7 @@ class CPKind(BoxKind):
     """See Kind."""
 
     name = "cp"
-    good_for = "Single objects in a few hundred kilobytes; more work per sample than vm."
+    good_for = "Objects and small scenes in up to a megabyte; in more planes and vm show more."
     field = CPField
     takes = frozenset({"ranks", "sh_degree"})
 
