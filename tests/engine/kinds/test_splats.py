@@ -122,6 +122,8 @@ def test_a_bundle_gives_the_same_field(field):
     cut = field.with_occupancy(field.occupancy.marked(half))
     stored = SplatsField.from_state(*cut.state())
     np.testing.assert_array_equal(stored.occupancy.occupied, cut.occupancy.occupied)
+    arrays, metadata = cut.state()
+    assert ("occupancy.bricks" in arrays) == (metadata.get("needs") == ["held"])
 
 
 @pytest.mark.parametrize(

@@ -184,7 +184,8 @@ class SplatsField(ComputedField):
         as_held = np.array_equal(self.occupancy.occupied.ravel(), np.diff(self.first) > 0)
         if not (as_held and np.array_equal(self.occupancy.aabb, self.box)):
             few = few_cells(sum(array.size for array in arrays.values()))
-            arrays |= packed_bits("occupancy", self.occupancy.occupied, few)
+            packed = packed_bits("occupancy", self.occupancy.occupied, few)
+            arrays, metadata = arrays | packed, ({"needs": ["held"]} if len(packed) > 1 else {}) | metadata
             metadata["occupancy"] = {
                 "aabb": self.occupancy.aabb.tolist(), "counts": list(self.occupancy.occupied.shape)
             }  # fmt: skip
